@@ -130,17 +130,17 @@ class ResultWriter:
                 self._take_position(message)
             case _:
                 pass
-        states = self._recorder.states
-        lost = self._store.lost
-        states.report(self._store.path.name, self._store.trouble or lost)
-        if lost:
-            self._on_notice(f"{self._store.path}: {lost}")
         if self._store.trouble:
+            self._recorder.states.report(self._store.path.name, self._store.trouble)
             self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
 
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""
         self._store.frame_done()
+        lost = self._store.lost
+        self._recorder.states.report(self._store.path.name, self._store.trouble or lost)
+        if lost:
+            self._on_notice(f"{self._store.path}: {lost}")
         _, clip = self._in_chain.popleft()
         if self._hauls is not None:
             self._hauls.frame_done()
