@@ -32,7 +32,7 @@ _MASKS = [
     (re.compile(r"token=\S+"), "token=<token>"),
     (re.compile(r"127\.0\.0\.1:\d+"), "127.0.0.1:<port>"),
     (re.compile(r"\b\d+(\.\d+)? (frames/s|fps|ms|s|min|MB|kB|KB|GB)(?![\w])"), r"<amount> \2"),
-    (re.compile(r"\b\d+ times real time"), "<amount> times real time"),
+    (re.compile(r"\b\d+(\.\d+)? times real time"), "<amount> times real time"),
     (re.compile(r'"(elapsed_s|fps|frames_per_s|real_time|free_bytes|rss_mb)": [\d.]+'), r'"\1": 0'),
 ]
 _PROGRESS = re.compile(
