@@ -1,29 +1,16 @@
 """Candidates by a user's own ONNX detector and by the U-Net.
 
-An ONNX file is run by onnxruntime on the CPU. It is tried on three pictures before the first frame,
-so that an unusable model is refused at once and not in the middle of a run. Its outputs are:
-
-yolo: (1, 4 + C, N), x, y, w, h of the center and C scores, input pixels (YOLOv8 and later).
-yolov5: (1, N, 5 + C), x, y, w, h, objectness, C scores, input pixels (YOLOv5, YOLOX decoded).
-yolo-nms: (1, N, 6), left, top, right, bottom, score, class, input pixels (exported with NMS).
-detr: boxes (1, N, 4) as x, y, w, h, fractions of the input, and logits (1, N, C + 1), the last of
-them "nothing" (DETR). rt-detr: the same with C independent logits (RT-DETR, RF-DETR, DINO).
-
-Three kinds find each fish's mask as well, which no segmenter then looks for:
-
-yolo-seg: yolo's rows with M more of weights, and M pictures (1, M, h, w) of which they make the
-logits of a mask (YOLOv8-seg and later). rf-detr-seg: rt-detr's boxes and logits, and the logits of
-masks (1, N, h, w) (RF-DETR Seg). mask-rcnn: boxes (N, 4) in input pixels, classes (N), scores (N)
-and probabilities (N, 1, height, width) (Mask R-CNN of torchvision). A mask spans the whole input.
+An ONNX file is run by onnxruntime. It is tried on three pictures before the first frame, so that an
+unusable model is refused at once and not in the middle of a run.
 
 The U-Net, which also finds masks, finds fish in the whole frame at low resolution, for cameras and
 seas that move so much that no fish stands out by its motion.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -31,6 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate
+from stream_dmr.detection.onnx_outputs import MASKS, NUM_OUTPUTS, Layout, OutputShapeError, decode
 from stream_dmr.errors import ModelError
 from stream_dmr.geometry import components, whole_pixels
 from stream_dmr.messages import Frame
@@ -38,142 +26,6 @@ from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.networks.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.segmentation.unet_segmenter import UNetSegmenter
 from stream_dmr.settings import Settings
-
-Layout = Literal[
-    "yolo", "yolov5", "yolo-nms", "detr", "rt-detr", "yolo-seg", "rf-detr-seg", "mask-rcnn"
-]
-NUM_OUTPUTS: dict[str, int] = {
-    "yolo": 1,
-    "yolov5": 1,
-    "yolo-nms": 1,
-    "detr": 2,
-    "rt-detr": 2,
-    "yolo-seg": 2,
-    "rf-detr-seg": 3,
-    "mask-rcnn": 4,
-}
-
-# x0, y0, x1, y1 in input pixels; scores by class
-BoxesAndScores = tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N C"]]
-
-
-class OutputShapeError(ValueError):
-    """The outputs are not of the layout; the message says what was expected."""
-
-
-def decode(
-    outputs: Sequence[np.ndarray], layout: str, *, input_size: tuple[int, int]
-) -> BoxesAndScores:
-    """Boxes x0, y0, x1, y1 in input pixels, and their scores by class.
-
-    `input_size` is (width, height). Raises OutputShapeError.
-    """
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN is refused later
-        return _DECODERS[layout]([np.asarray(o, np.float64) for o in outputs], input_size)
-
-
-def _yolo(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
-    (rows,) = outputs
-    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[1] < 5:
-        raise OutputShapeError("(1, 4 + classes, boxes)")
-    if rows.shape[1] > rows.shape[2]:
-        raise OutputShapeError("(1, 4 + classes, boxes) with more boxes than classes")
-    return _corners(rows[0, :4].T), rows[0, 4:].T
-
-
-def _yolov5(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
-    (rows,) = outputs
-    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] < 6:
-        raise OutputShapeError("(1, boxes, 5 + classes)")
-    return _corners(rows[0, :, :4]), rows[0, :, 4:5] * rows[0, :, 5:]
-
-
-def _yolo_nms(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
-    (rows,) = outputs
-    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] != 6:
-        raise OutputShapeError("(1, boxes, 6)")
-    classes = np.maximum(rows[0, :, 5], 0).astype(int)
-    scores = np.zeros((len(classes), int(classes.max(initial=0)) + 1))
-    scores[np.arange(len(classes)), classes] = rows[0, :, 4]
-    return rows[0, :, :4], scores
-
-
-def _detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndScores:
-    boxes, logits = _boxes_and_logits(outputs)
-    odds = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return boxes * np.tile(input_size, 2), (odds / odds.sum(axis=1, keepdims=True))[:, :-1]
-
-
-def _rt_detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndScores:
-    boxes, logits = _boxes_and_logits(outputs)
-    return boxes * np.tile(input_size, 2), _sigmoid(logits)
-
-
-def _yolo_seg(outputs: list[np.ndarray], size: tuple[int, int]) -> BoxesAndScores:
-    rows, pictures = outputs
-    if rows.ndim != 3 or pictures.ndim != 4 or rows.shape[1] < 5 + pictures.shape[1]:
-        raise OutputShapeError("(1, 4 + classes + M, boxes) and (1, M, height, width)")
-    return _yolo([rows[:, : -pictures.shape[1]]], size)
-
-
-def _rf_detr_seg(outputs: list[np.ndarray], size: tuple[int, int]) -> BoxesAndScores:
-    *rest, masks = outputs
-    if masks.ndim != 4 or masks.shape[:2] != rest[0].shape[:2]:
-        raise OutputShapeError("(1, boxes, 4), (1, boxes, classes), (1, boxes, height, width)")
-    return _rt_detr(rest, size)
-
-
-def _mask_rcnn(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
-    boxes, labels, scores, masks = outputs
-    if boxes.ndim != 2 or boxes.shape[1] != 4 or masks.ndim != 4 or masks.shape[1] != 1:
-        raise OutputShapeError("(boxes, 4), (boxes), (boxes), (boxes, 1, height, width)")
-    return _yolo_nms([np.column_stack([boxes, scores, labels])[None]], (0, 0))
-
-
-# Fish probability of the box of an index over the whole input, by the layouts that have masks.
-_MASKS: dict[str, Callable[[Sequence[np.ndarray], int], Float[np.ndarray, "h w"]]] = {
-    "yolo-seg": lambda outputs, index: _sigmoid(
-        np.tensordot(outputs[0][0, -outputs[1].shape[1] :, index], outputs[1][0], axes=1)
-    ),
-    "rf-detr-seg": lambda outputs, index: _sigmoid(outputs[2][0, index]),
-    "mask-rcnn": lambda outputs, index: outputs[3][index, 0],
-}
-
-
-def _sigmoid(logits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    return 1 / (1 + np.exp(-logits.clip(-60, 60)))
-
-
-def _boxes_and_logits(outputs: list[np.ndarray]) -> BoxesAndScores:
-    """The two outputs, in either order; boxes still as fractions of the input."""
-    shapes = [output.shape for output in outputs]
-    if any(len(shape) != 3 or shape[0] != 1 for shape in shapes) or shapes[0][1] != shapes[1][1]:
-        raise OutputShapeError("(1, boxes, 4) and (1, boxes, classes)")
-    boxes = [i for i, shape in enumerate(shapes) if shape[2] == 4]
-    if not boxes:
-        raise OutputShapeError("(1, boxes, 4) and (1, boxes, classes)")
-    # Where both have four columns, the boxes are the one with values from 0 to 1.
-    first = min(boxes, key=lambda i: float(np.abs(outputs[i] - 0.5).max(initial=0.0)))
-    return _corners(outputs[first][0]), outputs[1 - first][0]
-
-
-def _corners(boxes: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Center and size as left, top, right, bottom."""
-    half = boxes[:, 2:] / 2
-    return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
-
-
-_DECODERS: dict[str, Callable[[list[np.ndarray], tuple[int, int]], BoxesAndScores]] = {
-    "yolo": _yolo,
-    "yolov5": _yolov5,
-    "yolo-nms": _yolo_nms,
-    "detr": _detr,
-    "rt-detr": _rt_detr,
-    "yolo-seg": _yolo_seg,
-    "rf-detr-seg": _rf_detr_seg,
-    "mask-rcnn": _mask_rcnn,
-}
-
 
 _GREY_LEVEL = 114  # of the bars, as the YOLO family is trained
 
@@ -291,7 +143,7 @@ class OnnxDetector:
 
     @property
     def gives_masks(self) -> bool:
-        return self._settings.onnx_layout in _MASKS
+        return self._settings.onnx_layout in MASKS
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The boxes of a frame after non-maximum suppression; none whose mask is empty."""
@@ -309,7 +161,7 @@ class OnnxDetector:
             self._min_score,
             self._settings.onnx_overlap,
         )
-        mask_of, found = _MASKS.get(self._settings.onnx_layout), list[Candidate]()
+        mask_of, found = MASKS.get(self._settings.onnx_layout), list[Candidate]()
         for i in np.array(kept, int).ravel():
             inside = None
             if mask_of is not None:

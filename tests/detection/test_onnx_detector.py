@@ -9,7 +9,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from stream_dmr.detection.network_detectors import Layout, Letterbox, OnnxDetector, OnnxSettings
+from stream_dmr.detection.network_detectors import Letterbox, OnnxDetector, OnnxSettings
+from stream_dmr.detection.onnx_outputs import Layout
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.errors import ModelError
 from stream_dmr.geometry import whole_pixels

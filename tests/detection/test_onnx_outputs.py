@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.detection.network_detectors import OutputShapeError, decode
+from stream_dmr.detection.onnx_outputs import OutputShapeError, decode
 
 INPUT = (320, 240)  # width, height
 
