@@ -59,7 +59,7 @@ class SmoothLengthSettings(Settings):
         description="error that all frames of a fish share beside shape and plane, std over length",
     )
     upward_share: float = Field(
-        default=0.65,
+        default=0.7,
         gt=0,
         lt=1,
         description="share of a 95 % interval above its length: a slant that nobody sees makes a "
