@@ -247,8 +247,8 @@ class ClipFolder(Source):
                 frame_index += 1
                 if frame.frame_index == done + 1:  # what was read before may lie before the last
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
+                last_ns = max(last_ns, start_ns + frame.timestamp_ns)
                 if frame.frame_index > done:
-                    last_ns = start_ns + frame.timestamp_ns
                     self._frames_done[path.name] = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             for line in self._video.warnings:

@@ -272,6 +272,8 @@ class LengthStore:
         """Say what ended the run, before `close`; `promised`: where that is known only now."""
         promised = self._facts.frames_promised if promised is None else promised
         self._facts = replace(self._facts, ended_by=ended_by, frames_promised=promised)
+        last_ns = max(self._used.timestamp_ns, self.last_ns)
+        self._used = replace(self._used, timestamp_ns=last_ns)
 
     def clip_progress(self, name: str, *, frames_done: int) -> None:
         """Mark how far a clip is measured; durable with the next fish or mark.

@@ -117,6 +117,16 @@ def test_a_restart_changes_no_capture_time(tmp_path: Path, num_done: int):
     assert [frame.timestamp_ns for frame in folder] == times[num_done:]
 
 
+def test_what_follows_a_clip_that_was_done_begins_after_it(tmp_path: Path):
+    """Even if the last capture time was not noted any more, as by a crash."""
+    for number, name in enumerate(("1.avi", "2.avi"), start=1):
+        clip(tmp_path / name, first=number, num_frames=20)
+    times = [frame.timestamp_ns for frame in ClipFolder(tmp_path, AT_ONCE)]
+    folder = ClipFolder(tmp_path, AT_ONCE)
+    folder.resume(ResumePoint(after_ns=times[5], frames_done={"1.avi": 20}))
+    assert [frame.timestamp_ns for frame in folder] == times[20:]
+
+
 def test_a_clip_is_read_when_it_has_come_and_not_before(tmp_path: Path):
     clip(tmp_path / "1.avi", first=1)
     whole = clip(tmp_path / "whole", first=5)
