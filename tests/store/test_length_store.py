@@ -168,13 +168,16 @@ def test_what_was_handed_out_is_not_handed_out_again(tmp_path_factory, runs: lis
         store.close()
 
 
-def test_frame_numbers_and_times_go_on(store: LengthStore):
+@pytest.mark.parametrize("is_ended", [False, True])
+def test_frame_numbers_and_times_go_on(store: LengthStore, is_ended: bool):
     for index in range(1, 4):
         store.frame_passed(frame_index=index, timestamp_ns=10**18 + index)
+    if is_ended:
+        store.end("the end of the source")
     store.close()
     after = LengthStore(store.path.parent, FACTS)
     assert after.before.frame_index >= 3
-    assert after.before.timestamp_ns >= 10**18
+    assert after.before.timestamp_ns >= 10**18 + (3 if is_ended else 0)
     after.close()
 
 
