@@ -92,7 +92,7 @@ def test_the_same_frames_give_the_same_bits():
         (2300.0, {"COD": 0.6, "HAP": 0.4}, "fork", 2300.0),  # unsure
         (2300.0, {"COD": 0.01, "HAP": 0.99}, "fork", 2300.0),
         (2300.0, {}, "fork", 2300.0),  # nobody said the species
-        (2030.0, {"COD": 0.99, "HAP": 0.01}, "fork", 2030.0),  # the interval reaches below 2 m
+        (2010.0, {"COD": 0.99, "HAP": 0.01}, "fork", 2010.0),  # the interval reaches below 2 m
         (1300.0, {"SKJ": 0.99, "ALB": 0.01}, "fork", None),
         (1300.0, {"SKJ": 0.99, "ALB": 0.01}, "total", 1300.0),  # known is the fork length
     ],
