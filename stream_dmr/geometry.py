@@ -53,6 +53,10 @@ def whole_pixels(bbox_xyxy_px: Float[np.ndarray, "4"]) -> tuple[int, int, int, i
     return x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)
 
 
+def longer_side(box: Float[np.ndarray, "4"]) -> float:
+    return float((box[2:] - box[:2]).max())
+
+
 def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
     """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
     overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])

@@ -20,7 +20,7 @@ from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.motion_detector import MotionDetector
 from stream_dmr.detection.picture_views import find_in_view
 from stream_dmr.detection.still_water import StillWater
-from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
+from stream_dmr.geometry import box_iou, fraction_inside, longer_side, whole_pixels
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
 
@@ -102,8 +102,7 @@ class FusedDetector:
 
         What has less than 20 px in the detector's picture of the whole frame can't be told there.
         """
-        size_px = float((bbox_xyxy_px[2:] - bbox_xyxy_px[:2]).max())
-        side = max(_SURROUNDINGS * size_px, _MIN_SURROUNDINGS_PX)
+        side = max(_SURROUNDINGS * longer_side(bbox_xyxy_px), _MIN_SURROUNDINGS_PX)
         middle = (bbox_xyxy_px[:2] + bbox_xyxy_px[2:]) / 2
         limits = np.array(frame.image.shape[1::-1])
         low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)

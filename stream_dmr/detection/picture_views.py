@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stream_dmr.detection.detector import Candidate, Detector
-from stream_dmr.geometry import box_iou, fraction_inside
+from stream_dmr.geometry import box_iou, fraction_inside, longer_side
 from stream_dmr.messages import Frame
 
 # A detector misses small fish, and fish that fill the picture or their tails. Chosen on photographs
@@ -42,7 +42,7 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     large = [
         one
         for one in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
-        if _side_px(one) > _LARGE * max(height, width)
+        if longer_side(one.bbox_xyxy_px) > _LARGE * max(height, width)
     ]
     whole, others = [*detector.find(frame)], list[Candidate]()
     rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
@@ -59,13 +59,9 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     for one in sorted([*whole, *others], key=lambda one: -one.score):
         if not any(_are_same(one, fish) for fish in kept):
             kept.append(one)
-    longest_px = max((_side_px(one) for one in kept if one.score >= _SURE_NEAR), default=0.0)
-    return [one for one in kept if _side_px(one) >= _SHORTEST * longest_px]
-
-
-def _side_px(one: Candidate) -> float:
-    """The longer side of its box."""
-    return float((one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max())
+    sure = [longer_side(one.bbox_xyxy_px) for one in kept if one.score >= _SURE_NEAR]
+    longest_px = max(sure, default=0.0)
+    return [one for one in kept if longer_side(one.bbox_xyxy_px) >= _SHORTEST * longest_px]
 
 
 def _is_part(one: Candidate, fish: Candidate) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.errors import ModelError
+from stream_dmr.geometry import longer_side
 from stream_dmr.segmentation.promptable_segmenter import PromptableSegmenter
 from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
 from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter, is_unet_file
@@ -44,7 +45,7 @@ def segment_box(
     """
     mask = np.zeros(image.shape[:2], bool)
     # The box and its surroundings in whole pixels, half-open, inside the frame.
-    ring = _CONTEXT * max(bbox_xyxy_px[2:] - bbox_xyxy_px[:2])
+    ring = _CONTEXT * longer_side(bbox_xyxy_px)
     x0, y0 = np.floor(bbox_xyxy_px[:2] - ring).astype(int).clip(0, mask.shape[::-1]).tolist()
     x1, y1 = np.ceil(bbox_xyxy_px[2:] + ring).astype(int).clip(0, mask.shape[::-1]).tolist()
     region = image[y0:y1, x0:x1]

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from stream_dmr.geometry import longer_side
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.segmentation.crop_geometry import mask_bbox_in_frame
@@ -63,6 +64,6 @@ def _offset_px(
     """From the edges of a box to those of a mask, px; 0 for an empty mask and for small offsets."""
     if extent is None:
         return np.zeros(4)
-    size = max(box[2:] - box[:2])
+    size = longer_side(box)
     offset = np.clip(extent - box, -_MAX_OFFSET * size, _MAX_OFFSET * size)
     return np.where(abs(offset) > _MIN_OFFSET * size, offset, 0.0)

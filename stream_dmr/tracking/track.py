@@ -8,7 +8,7 @@ from filterpy.kalman import KalmanFilter
 from jaxtyping import Float
 
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.geometry import fraction_inside
+from stream_dmr.geometry import fraction_inside, longer_side
 from stream_dmr.tracking.confirmation import FishEvidence
 from stream_dmr.tracking.observation import Observation, dissimilarity, dissimilarity_if_covered
 from stream_dmr.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
@@ -78,7 +78,7 @@ class Track:
     @property
     def size(self) -> float:
         """The longer side of the box, px."""
-        return float(max(self._whole.box[2:] - self._whole.box[:2]))
+        return longer_side(self._whole.box)
 
     @property
     def center(self) -> Float[np.ndarray, "2"]:
