@@ -124,11 +124,16 @@ def is_longer_than_known(code: str, low_mm: float, *, given: str | None) -> bool
 
     No length from the snout is above the total one; others are compared with their own kind only.
     """
+    largest_mm, kind = _largest_length(code)
+    return low_mm > largest_mm and kind in ("total", given) and given != "disc width"
+
+
+@cache  # each frame asks
+def _largest_length(code: str) -> tuple[float, str]:
+    """Of a bundled species, mm, and which of its lengths that is; infinity where none is known."""
     species = find_species(code, _bundled())
     match = _LARGEST.fullmatch(species.largest) if species else None
-    if match is None or match[2] not in ("total", given) or given == "disc width":
-        return False
-    return low_mm > 10 * float(match[1])
+    return (math.inf, "") if match is None else (10 * float(match[1]), match[2])
 
 
 class SpeciesSettings(Settings):
