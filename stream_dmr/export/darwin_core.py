@@ -64,7 +64,7 @@ def occurrence_rows(fish: Fish, template: Template) -> list[dict[str, Any]]:
 def measurement_rows(fish: Fish, template: Template) -> list[dict[str, Any]]:
     """A row for each known length of a fish of `occurrence_rows`."""
     length_mm, given = fish.length_mm, template.tail_gives or ""
-    if length_mm is None or not occurrence_rows(fish, template):
+    if length_mm is None or fish.species is None or fish.utc_ns is None:
         return []
     by = "mesh fitted to outlines" if fish.review.length_mm is None else "ends by a reviewer"
     rows = list[dict[str, Any]]()

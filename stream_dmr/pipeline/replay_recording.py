@@ -316,11 +316,6 @@ def replay(
     comparator.finish()
     for line in (*recording.warnings, *recorded.notes):
         observer.warn(line)
-    versions = recording.header.metadata()
-    others = [name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != versions[name]]
-    ran_by = [facts.get("onnx_providers", "") for facts in (recording.metadata, versions)]
-    if all(ran_by) and ran_by[0] != ran_by[1]:
-        others.append("onnx_providers")
     return ReplaySummary(
         fish=writer.totals.fish(),
         num_frames=writer.num_frames,
@@ -331,9 +326,17 @@ def replay(
         num_left_out=comparator.num_left_out,
         num_beyond=comparator.num_beyond,
         mismatches=comparator.mismatches,
-        other_versions=others,
+        other_versions=_other_versions(recording),
         length_change=comparator.length_change,
     )
+
+
+def _other_versions(recording: Recording) -> list[str]:
+    """What of the versions by which bits are the same is another one here."""
+    known, here = recording.metadata, recording.header.metadata()
+    others = [name for name in REPRODUCIBLE_BY if known.get(name) != here[name]]
+    ran_by = known.get("onnx_providers"), here["onnx_providers"]  # "": no network was opened
+    return [*others, "onnx_providers"] if all(ran_by) and ran_by[0] != ran_by[1] else others
 
 
 def _is_light(request: ReplayOptions) -> bool:
