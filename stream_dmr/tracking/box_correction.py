@@ -24,7 +24,7 @@ class BoxCorrector:
     """Per track, the offset from the detector's box to the extent of the mask found in it."""
 
     def __init__(self) -> None:
-        # (4,) left, top, right, bottom in px, by track number: what `correct` adds to a box.
+        # (4,) left, top, right, bottom in px, by track number: added to a box by `correct`.
         self._offsets_px: dict[int, np.ndarray] = {}
         self._boxes: Mapping[int, np.ndarray] = {}  # the detector's boxes of the current frame
 

@@ -1,10 +1,10 @@
 """Confirm a track as a fish once it was clearly segmented in enough frames inside the zone.
 
-The tracker follows whatever moves. Gaffs and waves are distinguished from fish by their masks,
+The tracker follows all that moves. Gaffs and waves are distinguished from fish by their masks,
 which are empty or of low confidence.
 
-Plants sway and marks glitter in their places, rock passes by before a camera that moves; none of
-them looks like a fish. Letters and stones may, but stay where they are.
+Plants sway, marks glitter and rocks pass by before a moving camera, but none of them looks like a
+fish. Letters and stones may look like a fish, but they stay in place.
 """
 
 from collections import Counter, deque
@@ -20,11 +20,11 @@ from stream_dmr.messages import FishCrop
 from stream_dmr.settings import Settings
 
 _MAX_KEPT_CROPS = 10  # of a track that is not confirmed; chosen
-# After so many frames in a row whose masks show as good as nothing, a track is at another thing:
-# the place where its fish was. Of simulated fish at most three frames in a row are unclear.
+# After so many frames in a row with empty or very doubtful masks, a track follows another thing:
+# the place where its fish was. Simulated fish are unclear in at most three frames in a row.
 _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
-# Of a track's frames: a lamp or a leaf that is seen for hours is clear in four of them. Real fish
-# were clear in a seventh and more when they were confirmed, but one; docs/research/tracking.md.
+# Share of a track's frames: a lamp or a leaf that is seen for hours is clear in four of them. All
+# real fish but one were clear in a seventh and more when confirmed; docs/research/tracking.md.
 _MIN_CLEAR_SHARE = 0.1
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -62,7 +62,7 @@ class ConfirmationSettings(Settings):
 
 
 class FishConfirmation:
-    """Decides which tracks are fish; a confirmed one stays confirmed, and counts while seen."""
+    """Decide which tracks are fish. A confirmed track stays confirmed and counts while seen."""
 
     def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
@@ -70,17 +70,17 @@ class FishConfirmation:
         self._num_frames: Counter[int] = Counter()  # of unconfirmed tracks
         self._num_clear_frames: Counter[int] = Counter()  # likewise
         self._clear_crops: dict[int, deque[FishCrop]] = {}  # likewise, the latest
-        self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
+        self._num_empty_frames: Counter[int] = Counter()  # of confirmed tracks, in a row
 
     def is_confirmed(self, number: int) -> bool:
         return number in self._confirmed
 
     def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> list[FishCrop]:
-        """Take a track's crop of one frame into account; itself if it shows a confirmed fish.
+        """Add a track's crop of one frame; return the crop if the track is a confirmed fish.
 
-        In the frame that confirms it, the earlier ones that showed it clearly come before it.
-        `may_count`: False while the other evidence doubts it. A confirmed fish remains one
-        outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
+        The frame that confirms a fish also returns its earlier clear crops, which come first.
+        `may_count`: False while other evidence doubts the fish. A confirmed fish remains a fish
+        outside the zone. A crop without `mask_confidence` (a given mask) is clearly seen.
         """
         confidence = crop.quality.mask_confidence
         earlier: list[FishCrop] = []
@@ -94,7 +94,7 @@ class FishConfirmation:
                 return []
             self._confirmed.add(number)
             del self._num_frames[number], self._num_clear_frames[number]
-            earlier = [one for one in self._clear_crops.pop(number, ()) if one is not crop]
+            earlier = [old for old in self._clear_crops.pop(number, ()) if old is not crop]
         if confidence is None or confidence >= _NOTHING:
             self._num_empty_frames.pop(number, None)
         else:
@@ -102,8 +102,8 @@ class FishConfirmation:
         return [*earlier, crop] if self._num_empty_frames[number] <= _MAX_EMPTY_FRAMES else []
 
     def forget_all_but(self, numbers: Collection[int]) -> None:
-        """Forget what was seen of other tracks that are not confirmed."""
-        for number in [one for one in self._num_frames if one not in numbers]:
+        """Forget the crops of all other tracks that are not confirmed."""
+        for number in [n for n in self._num_frames if n not in numbers]:
             del self._num_frames[number], self._num_clear_frames[number]
             self._clear_crops.pop(number, None)
 
@@ -122,20 +122,20 @@ class FishConfirmation:
 
 _SURE = 0.6  # of how much it looks like a fish: in so many frames it need not move
 _MIN_SURE_FRAMES = 4
-# Of all frames: a stone that is seen for hours looks like a fish in a few of them. Chosen; visible
-# fish of real clips look like one in 40 % and more.
+# Share of all frames: a stone that is seen for hours looks like a fish in a few of them. Chosen;
+# visible fish in real clips look like a fish in 40 % of their frames and more.
 _MIN_SURE_SHARE, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
-# Sizes from where it was first seen. What went far is looked at in its own box alone, since the
-# network for masks loses a thin fish in a wider one.
+# Sizes from the place where it was first seen. A candidate that went far is cut out in its own box
+# alone, since the network for masks loses a thin fish in a wider box.
 _MIN_MOTION = 0.25
 _FAR = 0.5
 
 
 class FishEvidence:
-    """Of one track, over all its frames."""
+    """Evidence for and against one track being a fish, over all its frames."""
 
     def __init__(self, candidate: Candidate, size_px: float) -> None:
-        """`size_px`: the longer side of what is followed."""
+        """`size_px`: the longer side of the candidate."""
         self._first_edges_px = _edges_px(candidate)
         self._need_not_move = candidate.place_px is None  # somebody found it
         self._motion = 0.0
@@ -161,29 +161,29 @@ class FishEvidence:
 
     @property
     def has_moved(self) -> bool:
-        """True once it left its place, and for what need not move."""
+        """True if it left its place, or need not move to count."""
         return self._is_sure or self._motion > _MIN_MOTION
 
     @property
     def went_far(self) -> bool:
-        """True once it is far from its first place, and for what need not move."""
+        """True if it is far from its first place, or need not move to count."""
         return self._is_sure or self._motion > _FAR
 
     @property
     def _is_sure(self) -> bool:
-        """True for what somebody found, and for what looked like a fish often enough."""
+        """True if it was given, or looked like a fish often enough."""
         needed = max(_MIN_SURE_FRAMES, _MIN_SURE_SHARE * self._judged_frames)
         return self._need_not_move or self._sure_frames >= needed
 
     def looks_like_a_fish(self, min_frames: int) -> bool:
-        """True once it did in so many frames, and for what nothing judged."""
+        """True if it looked like a fish in so many frames, or if no detector judged it."""
         is_rare = self._fish_like_frames < _MIN_FISH_LIKE_SHARE * self._judged_frames
         seen = self._fish_like_closer + (0 if is_rare else self._fish_like_frames)
         return self._judged_frames == 0 or seen >= min_frames
 
 
 def _edges_px(candidate: Candidate) -> Float[np.ndarray, "2 2"] | None:
-    """Left and top, right and bottom of its box where it is in the scene."""
+    """Left, top and right, bottom of its box in the scene; None without a place."""
     if candidate.place_px is None:
         return None
     half = (candidate.bbox_xyxy_px[2:] - candidate.bbox_xyxy_px[:2]) / 2

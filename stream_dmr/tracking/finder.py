@@ -1,8 +1,8 @@
 """Find the fish of a video: detector, tracker and confirmation together.
 
-A detector may find a fish of a picture twice, or take a part of a fish for another one: a box with
-a fish's tail and one without it, or a fish and its fin, overlap too little to be one box. Their
-masks tell: fish share no pixels.
+A detector may find a fish twice in a picture, or take a part of a fish for another fish. A box with
+a fish's tail and a box without it, or a fish and its fin, overlap too little to be one box. Their
+masks decide: two fish share no pixels.
 """
 
 from collections.abc import Collection, Mapping
@@ -38,20 +38,20 @@ from stream_dmr.tracking.tracker import Tracker, TrackerSettings
 
 @dataclass(kw_only=True)
 class Sightings:
-    """What was seen in the frames so far."""
+    """Counts of the candidates in the frames so far, to explain why there are no fish."""
 
     frames: int = 0
     candidates: int = 0  # shapes that a detector took for possible fish, over all frames
-    tracks: int = 0  # followed ones
-    any_moved: bool = False  # one of them moved from its place
-    any_fish_like: bool = False  # one of those looked like a fish
+    tracks: int = 0
+    any_moved: bool = False  # a track moved from its place
+    any_fish_like: bool = False  # a track that moved looked like a fish
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
 
 
 def explain_no_fish(
     seen: Sightings, refused: Mapping[str, int], *, min_frames: int, min_confidence: float
 ) -> str:
-    """One line: why no fish was found in these frames, and what to do.
+    """Return one line: why no fish was found in these frames, and what to do.
 
     `refused` are the detector's shapes that were no candidates, by reason; `min_frames` and
     `min_confidence` are `[track_fish] min_track_frames` and `min_mask_confidence`.
@@ -95,17 +95,17 @@ def explain_no_fish(
     )
 
 
-# Of a mask that lies inside another one. In 70 stills, repeats and fins had 0.85 and more of theirs
-# in the fish's, neighbours at most 0.14; see docs/research/real-lengths.md.
+# Share of a mask that lies inside another mask. In 70 stills, repeats and fins had 0.85 and more of
+# their pixels in the fish's mask, neighbours at most 0.14; see docs/research/real-lengths.md.
 _SAME = 0.5
 
 
 def without_repeats(crops: Mapping[int, FishCrop], scores: Mapping[int, float]) -> list[int]:
-    """The ids of crops of one picture without those whose masks lie in one of a higher score."""
+    """Ids of the crops of a picture, without crops whose masks lie in a mask of higher score."""
     kept: list[int] = []
-    for one in sorted(crops, key=lambda one: -scores[one]):
-        if all(share_inside(crops[one], crops[other]) <= _SAME for other in kept):
-            kept.append(one)
+    for track in sorted(crops, key=lambda track: -scores[track]):
+        if all(share_inside(crops[track], crops[other]) <= _SAME for other in kept):
+            kept.append(track)
     return sorted(kept)
 
 
@@ -121,7 +121,7 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
     return np.count_nonzero(crop.mask & (seen > 127)) / max(np.count_nonzero(crop.mask), 1)
 
 
-_MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as one at a frame
+_MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as a look at a frame
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -154,24 +154,24 @@ class TrackedFish:
         self._seen.frames += 1
         self._seen.candidates += len(candidates)
         if self.gives_masks:
-            tracked = [one for one in tracked if one.candidate.foreground is not None]
-        boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
-        visible = {one.track_number: one.visible_fraction for one in tracked}
-        self._evidence = {one.track_number: one.evidence for one in tracked}
-        self._scores = {one.track_number: one.candidate.score for one in tracked}
+            tracked = [fish for fish in tracked if fish.candidate.foreground is not None]
+        boxes = {fish.track_number: fish.candidate.bbox_xyxy_px for fish in tracked}
+        visible = {fish.track_number: fish.visible_fraction for fish in tracked}
+        self._evidence = {fish.track_number: fish.evidence for fish in tracked}
+        self._scores = {fish.track_number: fish.candidate.score for fish in tracked}
         self._look_closer(frame, boxes)
-        self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
+        self._seen.any_moved |= any(track.has_moved for track in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
         # Boxes of given masks are not corrected, since these have no confidence.
-        masks = {one.track_number: one.candidate.foreground for one in tracked}
+        masks = {fish.track_number: fish.candidate.foreground for fish in tracked}
         return [
             replace(
-                one,
-                mask=masks[one.source_id] if self.gives_masks else None,
-                mask_corner=whole_pixels(boxes[one.source_id])[:2],
-                may_be_no_fish=not self._is_surely_fish(one.source_id),
+                detection,
+                mask=masks[detection.source_id] if self.gives_masks else None,
+                mask_corner=whole_pixels(boxes[detection.source_id])[:2],
+                may_be_no_fish=not self._is_surely_fish(detection.source_id),
             )
-            for one in self._corrector.correct(boxes, visible, frame)
+            for detection in self._corrector.correct(boxes, visible, frame)
         ]
 
     def _passes_over(self, frame: Frame) -> bool:
@@ -183,13 +183,14 @@ class TrackedFish:
         )
 
     def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
-        """Look at one of those that move and, small as they are, look like no fish from afar."""
+        """Look closer at one moving track that, seen from afar, does not look like a fish."""
         if not isinstance(self._detector, FusedDetector):
             return
         waiting = [
             track
-            for track, one in self._evidence.items()
-            if one.has_moved and not self._may_count(track) and one.closer_looks < _MAX_CLOSER_LOOKS
+            for track, seen in self._evidence.items()
+            if seen.has_moved and seen.closer_looks < _MAX_CLOSER_LOOKS
+            if not self._may_count(track)
         ]
         if waiting:
             track = min(waiting, key=lambda track: self._evidence[track].closer_looks)
@@ -197,7 +198,7 @@ class TrackedFish:
             self._evidence[track].add_closer_look(looks)
 
     def _is_surely_fish(self, track: int) -> bool:
-        """True for a confirmed track, and for one that went far or that need not move."""
+        """True for a confirmed track, and for a track that went far or need not move."""
         if self._are_stills:
             return False
         return self._evidence[track].went_far or self._confirmation.is_confirmed(track)
@@ -213,7 +214,7 @@ class TrackedFish:
         return self._tracker.open_numbers
 
     def forget_tracks(self) -> None:
-        """Later frames show none of the fish of those before."""
+        """Forget all tracks: later frames show other fish."""
         self._tracker.forget_tracks()
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
@@ -236,12 +237,12 @@ class TrackedFish:
 
     @property
     def gives_masks(self) -> bool:
-        """True where the detector finds masks as well; else the segmenter does."""
+        """True if the detector finds masks as well; else the segmenter finds them."""
         return isinstance(self._detector, OnnxDetector) and self._detector.gives_masks
 
     @property
     def warnings(self) -> list[str]:
-        """Why there are no fish, where there are none; a missed one of several is not noticed."""
+        """Why there are no fish, if there are none. A fish missed among others is not noticed."""
         if self._found_any or self._seen.frames == 0:
             return []
         line = explain_no_fish(
@@ -264,12 +265,12 @@ class FishFinder(Protocol):
 
     @property
     def gives_masks(self) -> bool:
-        """True where every detection comes with a mask, so that no segmenter is needed."""
+        """True if every detection comes with a mask, so that no segmenter is needed."""
         ...
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know of the frames so far, one line each; complete at the end."""
+        """Warnings about the frames so far, one line each; complete at the end."""
         ...
 
     @property
@@ -281,18 +282,18 @@ class FishFinder(Protocol):
         ...
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """What may be fish in one frame. Raises AnnotationError for an unusable mask."""
+        """Detect candidates in a frame. Raises AnnotationError for an unusable mask."""
         ...
 
     @property
     def open_ids(self) -> Collection[int] | None:
-        """The ids that later frames may show; None if ids are given, so that nobody knows."""
+        """The ids that later frames may show; None if ids are given and the future is unknown."""
         ...
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
-        """Those of the frame's detections that are fish; `crops` and results by `source_id`.
+        """The crops of the frame's fish by `source_id`, from the `crops` of all detections.
 
-        A fish that is known as one only now comes with its crops of earlier frames.
+        A fish that is confirmed in this frame comes with its crops of earlier frames.
         """
         ...
 
@@ -305,10 +306,10 @@ def open_finder(
     track: TrackFishSettings,
     pictures: Path | None = None,
 ) -> FishFinder:
-    """Fish from annotation files where given; tracked ones otherwise, and for boxes without ids.
+    """Open annotation files if there are any; else track fish, as also for boxes without ids.
 
-    `pictures`: the source of the frames, after which masks and boxes may be named.
-    Raises AnnotationError or ModelError where a file cannot be read.
+    `pictures`: the source of the frames, whose names masks and boxes may refer to.
+    Raises AnnotationError or ModelError if a file cannot be read.
     """
     if boxes is None and masks is None:
         return TrackedFish(open_detector(detect), track)

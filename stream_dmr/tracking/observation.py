@@ -1,6 +1,6 @@
 """A candidate with the features that the tracker compares.
 
-How alike two views of fish look is told by histograms of the colours of their pixels. Of seven cues
+Histograms of the colours of their pixels measure how alike two views of fish look. Of seven cues
 that were compared (mean colour, area, length, silhouette, picture patch, histograms of one and of
 three channels), the joint histogram separates fish best; see docs/research/tracking.md.
 """
@@ -40,7 +40,7 @@ def colours_of(
 
 
 def middle_of(height: int, width: int) -> Bool[np.ndarray, "h w"]:
-    """An ellipse in the middle of a box, in whose corners there is background."""
+    """An ellipse in the middle of a box, without the background in the box's corners."""
     inside = np.zeros((height, width), np.uint8)
     center, axes = (width // 2, height // 2), (width // 3, height // 3)
     return cv2.ellipse(inside, center, axes, 0, 0, 360, 1, cv2.FILLED) > 0
@@ -65,9 +65,9 @@ def root_histogram(
 def dissimilarity(a: Colours, b: Colours, *, is_cut_off: bool = False) -> float:
     """1 less the Bhattacharyya coefficient: 0 for equal colours, 1 for none in common.
 
-    A silhouette beside a mere box differs from it by what is behind the fish. In the open that is
-    as it should be: where motion has lost a fish, the next box is mostly another's. A fish that is
-    `is_cut_off` by the picture's edge is lost by motion first, so there middles are compared.
+    A silhouette and a mere box differ by the background behind the fish. In the open that is
+    right: if motion loses a fish, the next box mostly shows another fish. For a fish that is
+    `is_cut_off` by the picture's edge, which motion loses first, the middles are compared.
     """
     first, second = (view.middle if view.silhouette is None else view.silhouette for view in (a, b))
     if is_cut_off and (a.silhouette is None or b.silhouette is None):
@@ -76,9 +76,9 @@ def dissimilarity(a: Colours, b: Colours, *, is_cut_off: bool = False) -> float:
 
 
 def dissimilarity_if_covered(a: Colours, b: Colours) -> float:
-    """The same where a gaff or a line covers part of one silhouette: what only one has is left out.
+    """The same, without the colours of one view only: a gaff or a line covers part of a silhouette.
 
-    1 where that is more than half of it, or a view has no silhouette.
+    1 if they are more than half of it, or if a view has no silhouette.
     """
     if a.silhouette is None or b.silhouette is None:
         return 1.0
@@ -87,7 +87,7 @@ def dissimilarity_if_covered(a: Colours, b: Colours) -> float:
 
 
 def _without_cover(bare: Float32[np.ndarray, "N"], covered: Float32[np.ndarray, "N"]) -> float:
-    """The dissimilarity where the second has colours that the fish, in the first, has not."""
+    """The dissimilarity if the second view has colours that the fish, in the first view, lacks."""
     own = bare > _MIN_ROOT_SHARE
     fish, seen = bare[own], covered[own]
     if seen @ seen < _MIN_VISIBLE:
@@ -108,7 +108,7 @@ class Observation:
         *,
         whole: Candidate | None = None,
     ) -> None:
-        """`whole`: the merged candidate of which this one is a piece; None: not a piece."""
+        """`whole`: the merged candidate of which this is a piece; None: not a piece."""
         self.candidate, self.whole, self.is_piece = candidate, whole, whole is not None
         self.box = candidate.bbox_xyxy_px
         self.center = (self.box[:2] + self.box[2:]) / 2
@@ -136,7 +136,7 @@ class Observation:
 
 def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
     """Width and length of the smallest rotated rectangle around a shape, px; zeros if empty."""
-    # The outlines have the hull of all pixels, of which there are fifty times as many.
+    # The outlines have the same hull as all pixels, which are fifty times as many.
     outlines, _ = cv2.findContours(shape.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if not outlines:
         return 0.0, 0.0

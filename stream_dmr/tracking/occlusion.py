@@ -1,9 +1,9 @@
 """Identities of fish that were hidden, or merged into one blob, settled when they are seen apart.
 
-While several fish form one blob, nothing tells which part is whose. Each track therefore keeps a
-snapshot from before they met, predicted at the speed that it had then. When blobs separate, all
-snapshots are assigned to all observations at once, by position, length, area and colours, so that
-even a swap made in the meantime is undone. The same re-identifies a fish that was behind something.
+While several fish form one blob, nothing shows which part is whose. So each track keeps a snapshot
+from before they met, predicted at the speed that it had then. When blobs separate, all snapshots
+are assigned to all observations at once, by position, length, area and colours, so that even a swap
+made in the meantime is undone. The same re-identifies a fish that was behind another object.
 """
 
 from collections.abc import Iterable, Sequence
@@ -70,7 +70,7 @@ class TrackSnapshot:
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def is_inside(self, box: Float[np.ndarray, "4"]) -> bool:
-        """True where the predicted center lies inside a box."""
+        """True if the predicted center lies inside a box."""
         return bool(np.all(self.state[:2, 0] >= box[:2]) and np.all(self.state[:2, 0] <= box[2:]))
 
 
@@ -82,7 +82,9 @@ def reidentify(
     The first `len(owners)` observations are already followed, observation i by the track of
     snapshot `owners[i]`; the others are new. Observations that fit no snapshot are left out.
     """
-    costs = np.array([[one.cost(observation) for observation in observations] for one in snapshots])
+    costs = np.array(
+        [[fish.cost(observation) for observation in observations] for fish in snapshots]
+    )
     costs[:, len(owners) :][costs[:, len(owners) :] > _MAX_COST_OF_NEW] = IMPOSSIBLE
     for column, row in enumerate(owners):
         costs[row, column] = min(costs[row, column], _MAX_COST) - _OWNER_DISCOUNT

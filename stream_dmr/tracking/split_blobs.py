@@ -1,8 +1,8 @@
 """Split a moving blob that several fish share, by where each fish is predicted to be.
 
 Motion blobs merge long before fish hide each other. A fish hardly changes from one frame to the
-next, so its last silhouette, moved to the predicted position, tells which pixels are its own. A
-remainder as large as a fish is another one, even if it was never seen before.
+next, so the pixels under its last silhouette, moved to the predicted position, are its own. A
+remainder as large as a fish is another fish, even if it was never seen before.
 """
 
 from collections.abc import Sequence
@@ -40,33 +40,33 @@ class PredictedSilhouette:
 def split_merged_blob(
     candidate: Candidate, known: Sequence[PredictedSilhouette]
 ) -> list[Candidate]:
-    """The candidate's pieces: one per visible fish, then those that no known fish explains.
+    """The candidate's pieces: one per visible fish, then the pieces that no known fish explains.
 
-    `[candidate]` where it has no `foreground`, or fewer than two pieces are large enough.
+    `[candidate]` if it has no `foreground`, or if fewer than two pieces are large enough.
     """
     if candidate.foreground is None:
         return [candidate]
     x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
     foreground = candidate.foreground
     fish, regions = list[PredictedSilhouette](), list[Bool[np.ndarray, "H W"]]()
-    for one in known:
-        region = _in_region(one, foreground.shape, (x, y))
+    for silhouette in known:
+        region = _in_region(silhouette, foreground.shape, (x, y))
         visible_px = np.count_nonzero(foreground & region)
-        if visible_px / max(np.count_nonzero(one.shape), 1) > _MIN_VISIBLE_FRACTION:
-            fish.append(one)
+        if visible_px / max(np.count_nonzero(silhouette.shape), 1) > _MIN_VISIBLE_FRACTION:
+            fish.append(silhouette)
             regions.append(region)
     if not fish or (len(fish) == 1 and not _may_be_several(foreground, fish[0])):
         return [candidate]
     distances = np.stack([_distance_px(region) for region in regions])
     nearest = distances.argmin(axis=0)
-    radii = [max(_MIN_MATCH_RADIUS_PX, _MATCH_RADIUS * one.length_px) for one in fish]
+    radii = [max(_MIN_MATCH_RADIUS_PX, _MATCH_RADIUS * single.length_px) for single in fish]
     is_near = distances.min(axis=0) <= np.array(radii)[nearest]
-    line_px = round(_LINE_WIDTH_RATIO * min(one.length_px for one in fish)) | 1
+    line_px = round(_LINE_WIDTH_RATIO * min(single.length_px for single in fish)) | 1
     owned = [foreground & is_near & (nearest == i) for i in range(len(fish))]
-    parts = [_components(_opened(one, line_px)) for one in owned]
+    parts = [_components(_opened(region, line_px)) for region in owned]
     pieces = [max(own, key=np.count_nonzero) for own in parts if own]
     pieces += _components(_opened(foreground & ~is_near, line_px))
-    min_area = _MIN_AREA_RATIO * min(one.area_px for one in fish)
+    min_area = _MIN_AREA_RATIO * min(single.area_px for single in fish)
     pieces = [piece for piece in pieces if np.count_nonzero(piece) >= min_area]
     if len(pieces) < 2:
         return [candidate]
@@ -74,7 +74,7 @@ def split_merged_blob(
 
 
 def _may_be_several(blob: Bool[np.ndarray, "H W"], fish: PredictedSilhouette) -> bool:
-    """True where a blob is too long or too wide for this fish; turning only widens a fish."""
+    """True if a blob is too long or too wide for this fish; turning only widens a fish."""
     if not fish.is_whole:
         return False
     width_px, length_px = oriented_extent(blob)
@@ -103,7 +103,7 @@ def _in_region(
 
 
 def _opened(mask: Bool[np.ndarray, "H W"], diameter_px: int) -> UInt8[np.ndarray, "H W"]:
-    """Morphological opening: without what is thinner than a disc of this diameter."""
+    """Morphological opening: removes what is thinner than a disc of this diameter."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter_px, diameter_px))
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
 

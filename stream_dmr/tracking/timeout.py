@@ -1,4 +1,4 @@
-"""Ends tracks whose ids are given, by the time for which nobody saw them."""
+"""End tracks with given ids after nobody saw them for a while."""
 
 from collections.abc import Iterable
 
@@ -16,7 +16,7 @@ class TrackTimeout:
         return [*self._last_ns]
 
     def step(self, timestamp_ns: int, seen: Iterable[int]) -> list[int]:
-        """Take the ids that a frame shows; return those that were unseen for longer."""
+        """Take the ids of a frame; return the ids that were unseen for longer than the timeout."""
         self._last_ns.update(dict.fromkeys(seen, timestamp_ns))
         earliest_ns = timestamp_ns - self._timeout_ns
         ended = [number for number, last_ns in self._last_ns.items() if last_ns < earliest_ns]

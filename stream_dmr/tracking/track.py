@@ -22,12 +22,12 @@ _ACCELERATION_STD = 0.06  # per frame squared
 _LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
 _DISSIMILARITY = 0.003  # of colours, per frame, that costs as much as one standard deviation
 _MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and are shaded
-_PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
+_PART_RATIO = 3.0  # of the colours of a part of a fish, to those of a whole fish
 _COVERED_COST = 4.0  # of supposing that something covers part of the fish
 _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 # Sizes between the predicted and the observed center: so many times the usual distance of this
-# fish, within limits; the upper one where its identity is uncertain, the last where it was seen
-# once, so that its speed is not known.
+# fish, within limits; the upper limit if its identity is uncertain, the last if it was seen only
+# once and its speed is unknown.
 _MAX_DEVIATIONS = 3.0
 _MIN_GATE, _MAX_GATE, _FIRST_GATE = 0.3, 0.7, 1.2
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
@@ -60,7 +60,7 @@ class Track:
         self._whole = observation
         self.area, self.colours = observation.area, observation.colours
         self.length = observation.length
-        self.was_separate = not observation.is_piece  # what is always a piece may be no fish
+        self.was_separate = not observation.is_piece  # always a piece: it may be no fish
         self._evidence = FishEvidence(observation.candidate, self.size)
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
@@ -190,7 +190,7 @@ class Track:
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def _distance(self, observation: Observation) -> float:
-        """From where the fish is predicted, sizes."""
+        """Sizes from the predicted place of the fish."""
         return float(np.hypot(*(observation.center - self.center)) / max(self.size, 1.0))
 
     @property
@@ -231,11 +231,11 @@ class Track:
 
     @property
     def _predicted_offset(self) -> Float[np.ndarray, "2"]:
-        """From the center last seen separately to the predicted one, px."""
+        """Offset in px from the center last seen separately to the predicted center."""
         return self.center - self._whole.center
 
     def is_in_frame(self, width: int, height: int) -> bool:
-        """True where the predicted center lies inside the frame."""
+        """True if the predicted center lies inside the frame."""
         return bool(np.all(self.center >= 0) and np.all(self.center <= [width, height]))
 
     def tracked_candidate(self) -> TrackedCandidate:

@@ -1,13 +1,13 @@
 """Multi-object tracking: each fish keeps its number through gaps, merged blobs and crossings.
 
 A constant-velocity Kalman filter per fish and the cheapest assignment of fish to candidates, after
-Bewley et al., "Simple online and realtime tracking", ICIP 2016. Where fish meet, their boxes say
+Bewley et al., "Simple online and realtime tracking", ICIP 2016. If fish meet, their boxes say
 little, so area and colour weigh as well; a blob that contains several fish is split by
 `split_blobs` or assigned to none of them, and `occlusion` settles their identities afterwards.
 
-Three numbers name a fish on its way. A detection's `source_id` is that of its annotation file or of
-its track in the tracker, and stays inside of segmentation. `TrackNumbering` turns it into the
-`track_id` of the FishCrop, once; every later message, table, database and recording has that one.
+A fish has three numbers on its way. A detection's `source_id` comes from its annotation file or
+from its track in the tracker, and stays inside of segmentation. `TrackNumbering` turns it into the
+`track_id` of the FishCrop, once; all later messages, tables, databases and recordings have that.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ from stream_dmr.tracking.track import Track, TrackedCandidate
 _MIN_MERGED_FRACTION = 0.55  # of a fish's predicted box inside a candidate that contains the fish
 _MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
 _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
-_MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another one
+_MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
 
 
 class TrackerSettings(Settings):
-    """The part of `[track_fish]` that says how fish are followed from frame to frame."""
+    """The part of `[track_fish]` about following fish from frame to frame."""
 
     max_lost_frames: int = Field(
         default=7, ge=0, description="a fish unseen for more consecutive frames is gone"
@@ -86,7 +86,7 @@ class Tracker:
             self.forget_tracks()
         for track in (*self._tracks, *self._hidden):
             track.predict(frame.frame_index)
-        observations = [piece for one in observations for piece in self._split(frame, one)]
+        observations = [piece for blob in observations for piece in self._split(frame, blob)]
         observations = self._without_merged(observations)
         unassigned = self._assign(observations)
         self._keep_covered(observations)
@@ -113,11 +113,11 @@ class Tracker:
             return [observation]
         silhouettes = [track.predicted_silhouette() for track in fish]
         pieces = split_merged_blob(
-            observation.candidate, [one for one in silhouettes if one is not None]
+            observation.candidate, [known for known in silhouettes if known is not None]
         )
         if len(pieces) < 2:
             return [observation]
-        return [Observation(frame.image, one, whole=observation.candidate) for one in pieces]
+        return [Observation(frame.image, piece, whole=observation.candidate) for piece in pieces]
 
     def _without_merged(self, observations: Sequence[Observation]) -> list[Observation]:
         """Drop observations that contain several fish; those fish are kept inside them."""
@@ -136,16 +136,16 @@ class Tracker:
         """Update each track with its observation; returns the unassigned observations."""
         if not self._tracks or not observations:
             return list(observations)
-        costs = np.array([[track.cost(one) for one in observations] for track in self._tracks])
+        costs = np.array([[track.cost(seen) for seen in observations] for track in self._tracks])
         assigned = set()
         for row, column in zip(*linear_sum_assignment(costs), strict=True):
             if costs[row, column] < IMPOSSIBLE:
                 self._tracks[row].update(observations[column])
                 assigned.add(column)
-        return [one for i, one in enumerate(observations) if i not in assigned]
+        return [seen for i, seen in enumerate(observations) if i not in assigned]
 
     def _keep_covered(self, observations: Sequence[Observation]) -> None:
-        """Keep lost fish that are predicted where another one has just been seen: behind it."""
+        """Keep lost fish that are predicted behind another fish that has just been seen."""
         for track in self._tracks:
             if track.lost_frames > 0 and track.may_be_hidden:
                 for observation in observations:
@@ -185,7 +185,7 @@ class Tracker:
                 self._tracks.append(Track(observation, self._num_started, frame_index))
 
     def _reidentify(self, unassigned: Sequence[Observation]) -> list[Observation]:
-        """Settle the identities of fish that were merged or lost; returns what is still unassigned.
+        """Settle the identities of fish that were merged or lost; return what is still unassigned.
 
         Tracks too young to be known count as new observations: they may be an older fish.
         """
@@ -199,20 +199,20 @@ class Tracker:
             t for t in self._tracks if t.frames_seen < _MIN_KNOWN_FRAMES and t.lost_frames == 0
         ]
         new = [*unassigned, *(track.observation for track in young)]
-        new = [one for one in new if not one.is_piece and not one.touches_border]
+        new = [seen for seen in new if not seen.is_piece and not seen.touches_border]
         taken = self._exchange(uncertain, new)
         self._tracks = [t for t in self._tracks if t not in young or t.observation not in taken]
         self._tracks += [track for track in self._hidden if track.lost_frames == 0]
         self._hidden = [track for track in self._hidden if track.lost_frames > 0]
         self._settle(uncertain)
-        return [one for one in unassigned if one not in taken]
+        return [seen for seen in unassigned if seen not in taken]
 
     def _exchange(
         self, uncertain: Sequence[Track], new: Sequence[Observation]
     ) -> list[Observation]:
-        """Reassign the uncertain fish to their tracks' and to new observations; returns the taken.
+        """Reassign the uncertain fish to their tracks' and to new observations; return the taken.
 
-        Where a track shows another fish, the fish's number and snapshot move to it.
+        If a track shows another fish, the fish's number and snapshot move to it.
         """
         owners = [t for t in uncertain if t.lost_frames == 0 and not t.observation.is_piece]
         if not uncertain or not (owners or new):
@@ -237,16 +237,17 @@ class Tracker:
         """Settle fish seen separately; keep the others inside the blobs that may hide them."""
         seen = [track for track in uncertain if track.lost_frames == 0]
         for track in uncertain:
-            blobs = [one.observation.outer_box for one in (seen if track.lost_frames else [track])]
+            others = seen if track.lost_frames else [track]
+            blobs = [other.observation.outer_box for other in others]
             track.make_uncertain().constrain_to_one_of(blobs)
         lost = [track.make_uncertain() for track in uncertain if track.lost_frames > 0]
         for track in seen:
-            if track.is_settled and not any(one.is_inside(track.observation.box) for one in lost):
+            if track.is_settled and not any(fish.is_inside(track.observation.box) for fish in lost):
                 track.settle()
 
 
 def _distribute_others(track_of: dict[int, Track], uncertain: Sequence[Track]) -> None:
-    """Give every fish without a track one of those left over, its own where possible.
+    """Give every fish without a track one of the left-over tracks, its own if possible.
 
     `track_of`: tracks by the fish's index in `uncertain`; completed in place.
     """
@@ -260,8 +261,8 @@ def _distribute_others(track_of: dict[int, Track], uncertain: Sequence[Track]) -
 class TrackNumbering:
     """Assigns track ids, each to one fish of the output folder, from 1.
 
-    An annotated fish keeps the id of its file; tracked ones are numbered as they come. Both are
-    counted on after the ids of earlier runs in the same folder.
+    An annotated fish keeps the id of its file; tracked fish are numbered as they come. Both follow
+    on the ids of earlier runs in the same folder.
     """
 
     def __init__(self, *, keeps_source_ids: bool) -> None:
