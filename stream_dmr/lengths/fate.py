@@ -67,7 +67,7 @@ class ZonesSettings(Settings):
 
 
 def shares_in(settings: ZonesSettings, points: Float[np.ndarray, "N 2"]) -> dict[str, float]:
-    """The share of `points` in each zone, by its fate; where zones overlap, the first has them."""
+    """The share of `points` in each zone, by its fate; if zones overlap, the first counts."""
     is_left, shares = np.ones(len(points), bool), dict[str, float]()
     for name, corners in settings.polygons():
         polygon = corners.astype(np.float32)
@@ -82,7 +82,7 @@ _POINTS_OF_BODY = 33  # chosen: shares to 3 %
 
 
 class Fate(NamedTuple):
-    """What became of a fish, and how much of its body says so."""
+    """What became of a fish, and the share of its body in that zone."""
 
     name: str  # "landed", "dropped", "cut off" or "unknown"
     share: float | None  # of the body in that zone, 0 to 1; None: its end was not seen
@@ -94,7 +94,7 @@ class FateTracker:
     def __init__(
         self, settings: ZonesSettings, *, frame_size: tuple[int, int] | None = None
     ) -> None:
-        """`frame_size`: width and height, px; what the fit has beyond it counts as at its edge."""
+        """`frame_size`: width and height, px; points of the fit beyond it count as at its edge."""
         self._settings = settings
         self._limit = None if frame_size is None else np.array(frame_size, float) - 1
         self._seen: LocalizedFish | None = None  # the last frame in which its body was fitted

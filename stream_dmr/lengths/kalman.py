@@ -80,7 +80,7 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class RobustStart:
-    """Where a track's filter starts, by the majority of its frames instead of the first one."""
+    """The start of a track's filter, by the majority of its frames instead of the first frame."""
 
     length_mm: float  # weighted median
     variance: float  # of that median, mm^2
@@ -150,7 +150,7 @@ class _ErrorCorrelation:
 
 
 class ConstantLengthFilter:
-    """The filter's way through one track: state and variance after each frame that it used."""
+    """The filter along one track: state and variance after each frame that it used."""
 
     def __init__(self, start: RobustStart, settings: SmoothLengthSettings) -> None:
         self.frames: list[int] = []

@@ -1,8 +1,8 @@
 """One length per fish from its frames: a running estimate, and a final one with its interval.
 
 Frames are weighted by the variance of their fit and gated by their innovation
-(`kalman.py`). The interval also holds what no averaging removes: the error that all frames
-of one fish share. Frames of one track are not independent measurements.
+(`kalman.py`). The interval also holds the error that all frames of a fish share, which no
+averaging removes. Frames of one track are not independent measurements.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ _CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
 
 def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measurement:
-    """Take the length of an accepted frame. Raises ValueError where it has no usable numbers."""
+    """Take the length of an accepted frame. Raises ValueError if it has no usable numbers."""
     length_mm, std_mm = fish.length_mm, fish.length_std_mm
     if length_mm is None or std_mm is None or not (0 < length_mm < np.inf and 0 <= std_mm < np.inf):
         raise ValueError(
@@ -41,7 +41,7 @@ def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measu
 
 
 class TrackLength:
-    """One fish: takes its frames in order, gives the running estimate and the final one."""
+    """One fish: takes its frames in order, returns the running estimate and the final one."""
 
     def __init__(self, first: LocalizedFish, settings: SmoothLengthSettings) -> None:
         self._settings = settings
@@ -145,11 +145,11 @@ class TrackLength:
     def _std_mm(
         self, length_mm: Float[np.ndarray, "N"], variance: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "N"]:
-        """Std from the filter's variance and from what frames of one fish have in common."""
+        """Std from the filter's variance and the errors that all frames of a fish share."""
         assert self._filter is not None
         shared = (self._settings.common_std_ratio * length_mm) ** 2
         # Of the log length, by the fish's own shape and distance from the plane.
-        ratio = float(np.mean([one.shared_std_ratio for one in self._measurements]))
+        ratio = float(np.mean([frame.shared_std_ratio for frame in self._measurements]))
         shared += (ratio * length_mm) ** 2
         return np.sqrt(variance * self._filter.design_effect + shared)
 

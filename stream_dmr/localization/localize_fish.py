@@ -3,7 +3,7 @@
 The fit knows the fish's shape in the orientation of the camera, but not its scale. The scale comes
 from the reference plane: the center lies on it (eq. 9-11), head and tail lie on the rays through
 their pixels (eq. 6-8) and, seen from the center, in the directions of the fitted shape (eq. 12).
-Of a fish that lies on the plane, each keypoint is as high above it as such bodies rest.
+The keypoints of a fish that lies on the plane are as high above it as such bodies rest.
 """
 
 from dataclasses import dataclass
@@ -20,16 +20,16 @@ from stream_dmr.settings import Settings
 
 _MIN_ANGLE_RAD = 1e-3  # between two lines, for their intersection to mean anything
 # Heights of head, center and tail of a fish that lies on its side, over half its thickness at the
-# center. A stiff body holds all three at 1; a limp one lets the tail down to 0, and the snout to
-# its own half thickness. Neither is known of a fish, so the ends are halfway between.
+# center. A stiff body holds all three at 1; a limp body lowers the tail to 0, and the snout to its
+# own half thickness. Neither is known of a fish, so the ends are halfway between.
 _LYING_HEIGHTS = np.array([0.5, 1.0, 0.25])
 _LYING_END_STD = 0.25  # of both ends' heights together: from stiff to limp is four stds
-# Of the thickness of a body form, relative: thickness over length differs so among specimens of one
-# species, by how full they are.
+# Relative std of a body form's thickness: thickness over length differs so much among specimens of
+# one species, by how full they are.
 _THICKNESS_STD = 0.3
-# Std of a fish's log length by its mask: where the mask is less sure, and by how much the length
-# changes in a longer box. All frames of a fish share it: a dark tail is dark in all of them. Fitted
-# to photographs that the segmenter never saw; see docs/research/real-pictures.md.
+# Std of a fish's log length by its mask: by its confidence, and by how much the length changes in a
+# longer box. All frames of a fish share it: a dark tail is dark in all of them. Fitted to
+# photographs that the segmenter never saw; see docs/research/real-pictures.md.
 _MASK_STD, _DOUBT_STD = 0.12, 0.35
 _HEIGHT_ROUNDS = 3  # the height goes with the length, which goes with the height
 
@@ -108,9 +108,9 @@ class Location:
     keypoints_mm: Float[np.ndarray, "3 3"]  # H', C', T'
     midline_mm: Float[np.ndarray, "M 3"]
     length_mm: float
-    length_std_mm: float | None  # without the part below; None where the fit can't tell
-    # Of an error that all frames of the fish share: its own shape, its distance from the plane, and
-    # what its masks lack.
+    length_std_mm: float | None  # without the shared part; None if the fit has no std
+    # Of the errors that all frames of the fish share: its own shape, its distance from the plane,
+    # and ends that its masks lack.
     shared_std_ratio: float
     slant_rad: float  # of the chord from the plane across the line of sight: 0 is broadside
     bow_ratio: float  # of the midline from its chord along the line of sight, over its length
@@ -120,7 +120,7 @@ class Location:
 def center_on_plane(ray: Float[np.ndarray, "3"], plane: ReferencePlane) -> Float[np.ndarray, "3"]:
     """C' of eq. (9)-(11): where the center's ray (X_c, Y_c, 1) meets the reference plane, in mm.
 
-    Raises Unlocatable where it meets the plane behind the camera, or never.
+    Raises Unlocatable if it meets the plane behind the camera, or never.
     """
     with np.errstate(divide="ignore"):
         depth_mm = float(plane.depth_mm(ray[None])[0])
@@ -138,8 +138,8 @@ def intersect(
 
     With noise the lines pass each other; the point nearest to both is taken, the middle of
     their common perpendicular. `direction` is h' - C' = h - c, at any scale.
-    Raises Unlocatable where the lines are nearly parallel, or meet behind the camera or on the
-    far side of the center.
+    Raises Unlocatable if the lines are nearly parallel, or meet behind the camera or on the far
+    side of the center.
     """
     size = np.linalg.norm(direction)
     if size == 0:
@@ -172,7 +172,7 @@ def locate_keypoints(
 
 
 def mask_std_ratio(quality: CropQuality) -> float:
-    """Std of the log length by what a found mask may lack or have too much at the ends."""
+    """Std of the log length by errors of a found mask at its ends; 0 for a given mask."""
     if quality.mask_confidence is None:
         return 0.0
     unsure = _MASK_STD * (1 - quality.mask_confidence)
@@ -202,11 +202,11 @@ def locate(
     slant_rad = slant(keypoints_mm)
     parts = [
         shape.length_std_ratio,
-        # Two joints can't follow every bend, and the outline doesn't say so.
+        # Two joints can't follow every bend, and the outline doesn't show it.
         settings.bending_std * (1.0 - chord_mm / length_mm),
-        # The length is the one seen over cos(slant), of which d log / d slant is tan(slant).
+        # The length is the seen length over cos(slant): d log / d slant is tan(slant).
         settings.slant_std_rad * np.tan(slant_rad),
-        # What the body can't follow may be anything; little of it is the mask's own roughness.
+        # A misfit of the body may be anything; little of it is the mask's own roughness.
         settings.misfit_std * ((1.0 - shape.iou) / 0.1) ** 3,
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
@@ -244,8 +244,8 @@ def lying_keypoints(
 ) -> tuple[Float[np.ndarray, "3 3"], float]:
     """H', C', T' in mm of a fish that lies on the plane, and the std of the log length by heights.
 
-    Each keypoint is where its ray meets the plane of its own height: gravity says how such a fish
-    lies, so the fit's slants are not asked. A point at height h, with the camera at distance D
+    Each keypoint is where its ray meets the plane of its own height: gravity determines how such a
+    fish lies, so the fit's slants are not used. A point at height h, with the camera at distance D
     from the plane, is at 1 - h / D of its ray. Raises Unlocatable.
     """
     rays = calibration.camera.back_project(shape.keypoints_px)
@@ -262,7 +262,7 @@ def lying_keypoints(
 
 
 def bend(shape: FittedShape) -> float | None:
-    """Bending ratio of the fitted midline, None where its ends coincide or it isn't finite."""
+    """Bending ratio of the fitted midline; None if its ends coincide or it isn't finite."""
     if not np.isfinite(shape.midline).all() or np.array_equal(shape.midline[0], shape.midline[-1]):
         return None
     return bending_ratio(shape.midline)
@@ -278,7 +278,7 @@ def slant(keypoints_mm: Float[np.ndarray, "3 3"]) -> float:
 def quality_refusal(
     shape: FittedShape, quality: CropQuality, settings: LocalizeSettings
 ) -> Reason | None:
-    """The first gate that a frame fails; None where it passes all."""
+    """The first gate that a frame fails; None if it passes all."""
     # "not >=" rather than "<", so that NaN fails
     checks = {
         Reason.TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
@@ -296,7 +296,7 @@ def localize(
 ) -> LocalizedFish:
     """Place one fit in millimetres and decide whether it may count towards the fish's length.
 
-    A frame that fails a gate keeps its millimetres, where it has any, for whoever looks at it.
+    A frame that fails a gate keeps its millimetres, if it has any, for reviewers.
     """
     if mesh.shape is None:
         return _message(mesh, mesh.refusal)

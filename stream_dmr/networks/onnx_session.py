@@ -1,4 +1,4 @@
-"""Open an ONNX file with onnxruntime, by what the installed one can run networks on."""
+"""Open an ONNX file with onnxruntime, on the execution providers that are installed."""
 
 import sys
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ _NUM_THREADS = 2  # the other stages need cores as well
 _CPU = "CPUExecutionProvider"
 # The first sends pictures to a server, the second compiles for minutes at each start.
 _NOT_TAKEN = ("AzureExecutionProvider", "TensorrtExecutionProvider")
-_NOISE_PX = 128  # sides of a test picture whose size is free
+_NOISE_PX = 128  # sides of a test picture if the input's size is free
 
 
 def providers() -> list[str]:
     """The execution providers of the installed onnxruntime, the preferred one first."""
     import onnxruntime  # takes 0.1 s, needed with a network only
 
-    return [one for one in onnxruntime.get_available_providers() if one not in _NOT_TAKEN]
+    return [name for name in onnxruntime.get_available_providers() if name not in _NOT_TAKEN]
 
 
 def providers_in_use() -> str:
@@ -35,7 +35,7 @@ def open_session(
     threads: int = _NUM_THREADS,
     by: Sequence[str] | None = None,
 ) -> Any:
-    """The `onnxruntime.InferenceSession` of a file, or of its `content` where that is at hand.
+    """The `onnxruntime.InferenceSession` of a file, or of its `content` if that is given.
 
     `by` are execution providers, default `providers()`. Raises ModelError for no or another file.
     """
@@ -48,7 +48,7 @@ def open_session(
     options.intra_op_num_threads = threads
     by = providers() if by is None else by
     # OpenVINO has threads of its own.
-    own = [{"num_of_threads": str(threads)} if "OpenVINO" in one else {} for one in by]
+    own = [{"num_of_threads": str(threads)} if "OpenVINO" in name else {} for name in by]
     try:
         return onnxruntime.InferenceSession(
             content or str(path), options, providers=[*zip(by, own, strict=True)]
@@ -61,24 +61,24 @@ def open_session(
 
 
 def provider_notice(path: Path) -> str:
-    """How far a network's outputs on noise are from the CPU's; "" where it runs on the CPU."""
+    """How far a network's outputs on noise are from the CPU's; "" if it runs on the CPU."""
     by = providers_in_use()
     if by in ("", _CPU):
         return ""
     rng = np.random.default_rng(0)
     session, on_cpu = open_session(path), open_session(path, by=[_CPU])
     feed = {
-        one.name: rng.integers(0, 256, _shape_of(one)).astype(
-            np.uint8 if one.type == "tensor(uint8)" else np.float32
+        given.name: rng.integers(0, 256, _shape_of(given)).astype(
+            np.uint8 if given.type == "tensor(uint8)" else np.float32
         )
-        for one in session.get_inputs()
+        for given in session.get_inputs()
     }
     pairs = zip(session.run(None, feed), on_cpu.run(None, feed), strict=True)
     off = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
     return f"networks run by {by} of onnxruntime, within {off:.2%} of the CPU on a test picture"
 
 
-def _shape_of(one: Any) -> list[int]:
-    """Of an input; free sizes are one picture of `_NOISE_PX`."""
-    free = [1, *[_NOISE_PX] * (len(one.shape) - 1)]
-    return [n if isinstance(n, int) else free[k] for k, n in enumerate(one.shape)]
+def _shape_of(given: Any) -> list[int]:
+    """The shape of an input; free sizes are those of one picture of `_NOISE_PX`."""
+    free = [1, *[_NOISE_PX] * (len(given.shape) - 1)]
+    return [n if isinstance(n, int) else free[k] for k, n in enumerate(given.shape)]

@@ -1,15 +1,13 @@
 """A U-Net small enough for two CPU cores (paper, Sec. 2; Ronneberger et al., MICCAI 2015).
 
-Its first convolution already halves the input, so that no layer works at full size; the last one
+Its first convolution halves the input, so that no layer works at full size; the last convolution
 gives four values per cell, which are the four pixels of that cell. The widths were chosen for 15 ms
 a crop on one core: 1.53 million weights, more than half of them in the coarsest level, which takes
 little time, need 3.3 ms (docs/research/start-and-memory.md).
 
-The trained U-Net as an ONNX model, which a run computes without torch.
-
-The graph is written node by node: PyTorch's exporters need packages of their own, and would not
-take `normalise` and the output's scaling along. Batch normalisation is folded into the convolution
-before it.
+A run computes the trained U-Net as an ONNX model, without torch. The graph is written node by node:
+PyTorch's exporters need packages of their own, and would leave out `normalise` and the output's
+scaling. Batch normalisation is folded into the convolution before it.
 """
 
 from pathlib import Path
@@ -125,7 +123,7 @@ def save_weights(network: UNet, path: Path) -> None:
 def load_weights(path: Path) -> UNet:
     """The network with these weights, in evaluation mode on the CPU.
 
-    Raises ModelError where the file cannot be read or is not one that `save_weights` wrote.
+    Raises ModelError if the file cannot be read or was not written by `save_weights`.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -213,7 +211,7 @@ class _Graph:
     def convolve(self, x: str, layer: nn.Module) -> str:
         assert isinstance(layer, nn.Conv2d)
         assert layer.bias is not None
-        weights = [self.constant(one.detach().numpy()) for one in (layer.weight, layer.bias)]
+        weights = [self.constant(values.detach().numpy()) for values in (layer.weight, layer.bias)]
         pads = [int(side) for side in layer.padding] * 2
         return self.add("Conv", [x, *weights], pads=pads, strides=list(layer.stride))
 

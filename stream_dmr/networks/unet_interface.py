@@ -1,4 +1,4 @@
-"""What the U-Net takes and gives, as sizes: everything about it that needs no torch."""
+"""Inputs, outputs and sizes of the U-Net, without torch."""
 
 from pathlib import Path
 
@@ -10,16 +10,16 @@ SIZES_PX = (128, 192, 256)  # width and height of the crops that it is trained o
 SIZE_MULTIPLE_PX = 32  # of its input's width and height: it halves the input five times
 ENDS_STRIDE = 4  # input pixels per cell of the maps of head and tail
 
-# Of its ONNX file.
+# Names in its ONNX file.
 IMAGES_INPUT, BOXES_INPUT = "images", "in_boxes"
 MASK_OUTPUT, ENDS_OUTPUT = "probability", "log_ends"
-MODEL_FORMAT = "stream-dmr unet 2"  # a new number where the network's layers change
+MODEL_FORMAT = "stream-dmr unet 2"  # a new number if the network's layers change
 
 
 def box_coverage(bbox_xyxy_px: Float[np.ndarray, "4"], *, size: int) -> Float32[np.ndarray, "S S"]:
     """The fraction of each pixel inside a box, 0 to 1; the box is half-open, in crop pixels.
 
-    This is the network's fourth channel, which tells it which of several fish is asked for.
+    This is the network's fourth channel: which of several fish to segment.
     """
     starts = np.arange(size)
     x0, y0, x1, y1 = bbox_xyxy_px

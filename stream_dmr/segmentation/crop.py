@@ -73,8 +73,8 @@ class CropFishSettings(Settings):
 _MIN_SAME_BOX_IOU = 0.85  # of the mask's box and the given one; below, the crop is cut again
 _MAX_CROPS = 3
 
-# Nine in ten masks have the IoU that is claimed, on sources that the weights never saw; see
-# docs/research/real-pictures.md. Networks are too sure on pictures unlike those they learnt from.
+# Nine in ten masks have the claimed IoU, on sources that the weights never saw; see
+# docs/research/real-pictures.md. Networks are too sure on pictures unlike their training pictures.
 _CONFIDENCE_POWER = 2.85
 
 
@@ -99,14 +99,14 @@ class FrameView:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class MaskedCrop:
-    """The crop of a fish with its mask, and what is known of both."""
+    """The crop of a fish with its mask and their quality."""
 
     image: UInt8[np.ndarray, "S S 3"]
     crop_camera: Camera
     mask: Bool[np.ndarray, "S S"]
     area_px: float  # of the mask, in frame pixels
     extent: Float[np.ndarray, "4"] | None  # the mask's box in frame pixels; None: an empty mask
-    is_cut: bool  # the mask reaches the crop's edge, so the fish may go on in the frame
+    is_cut: bool  # the mask reaches the crop's edge, so the fish may continue in the frame
     confidence: float | None  # see `mask_confidence`; None for a given mask
     ends: FishEnds | None
     unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front, or no fish
@@ -114,7 +114,7 @@ class MaskedCrop:
     length_doubt: float | None = None  # see `CropQuality`
 
     def touches_border(self, view: FrameView) -> bool:
-        """True where the fish may go on beyond the crop or the frame."""
+        """True if the fish may continue beyond the crop or the frame."""
         return self.is_cut or touches_border(self.extent, shape=view.shape, pixel_px=self.pixel_px)
 
 
@@ -124,7 +124,7 @@ def crop_given_mask(
     mask_layer: Layer,
     unknown: Bool[np.ndarray, "H W"] | None = None,
 ) -> MaskedCrop:
-    """The crop around a box and a mask of the frame, of which something may hide a part."""
+    """The crop around a box and a mask of the frame; `unknown` pixels hide parts of the fish."""
     given, (left, top) = mask_layer.image, mask_layer.corner
     x, y, w, h = cv2.boundingRect(given.view(np.uint8))
     # Only within its own box is there anything to do, which is a small part of the frame.
@@ -160,8 +160,8 @@ def crop_segmented(
 ) -> MaskedCrop:
     """The crop around a box, with the mask that a segmenter finds in it.
 
-    Where the mask fills another box than the given one, which may lack the tail or include a piece
-    of line, a new crop is cut around the mask. The most confident mask that is not cut is returned.
+    If the mask fills another box than the given one, which may lack the tail or include a piece of
+    line, a new crop is cut around the mask. The most confident mask that is not cut is returned.
     """
     height, width = view.shape
     box = visible_bbox(bbox_xyxy_px, None, width=width, height=height)
@@ -175,10 +175,10 @@ def crop_segmented(
 
 
 def crop_wider(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
-    """The crop of a wider box around a crop's mask, with what a segmenter finds in it.
+    """The crop of a wider box around a crop's mask, segmented again.
 
     The box grows by half its shorter side on each side: by more, a thin fish gets too small to be
-    recognised. An empty mask's crop is returned as it is.
+    recognised. A crop with an empty mask is returned as it is.
     """
     if crop.extent is None:
         return crop
@@ -188,7 +188,7 @@ def crop_wider(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Maske
 
 
 def agreement(crop: MaskedCrop, wider: MaskedCrop) -> float:
-    """IoU of a crop's mask with the one of a wider crop; 0 for an empty mask."""
+    """IoU of a crop's mask with the mask of a wider crop; 0 for an empty mask."""
     layer = crop.mask.view(np.uint8) * np.uint8(255)
     mask = cv2.warpAffine(layer, _crop_to_crop(crop, wider), wider.mask.shape[::-1])
     both, either = wider.mask & (mask > 127), wider.mask | (mask > 127)
@@ -205,7 +205,7 @@ def _segment(
     height, width = view.shape
     is_in_frame = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
     probability = np.mean([look.probability for look in looks], axis=0) * is_in_frame
-    # Of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map.
+    # Area of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map.
     areas = np.abs(_slope(x.T).T * _slope(y) - _slope(x) * _slope(y.T).T)
     min_area_px = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=min_area_px)
@@ -229,15 +229,15 @@ def _segment(
     )
 
 
-# A snout is where the network sees it, to 1 % of the length; a mask may go on beyond it along a
-# line, a shadow or the seam of a table. Chosen on photographs that the network never saw.
+# The network sees the snout to 1 % of the length, but a mask may continue beyond it along a line, a
+# shadow or the seam of a table. Chosen on photographs that the network never saw.
 _SURE_HEAD = 0.9  # least confidence of which end is the head
-_HEAD_REACH = 0.3  # of the length: how far around the snout it is looked for
-_LEAST_BEYOND, _KEPT_BEYOND = 0.05, 0.02  # of the length: where it counts, and what is left
+_HEAD_REACH = 0.3  # of the length: pixels so near the snout are examined
+_LEAST_BEYOND, _KEPT_BEYOND = 0.05, 0.02  # of the length: from where it counts; margin that is kept
 
 
 def beyond_head(mask: Bool[np.ndarray, "S S"], ends: FishEnds) -> Bool[np.ndarray, "S S"] | None:
-    """Where a mask goes on beyond the snout: what it holds there is unknown. None if it doesn't.
+    """The part of a mask beyond the snout, which is unknown; None if the mask ends there.
 
     Outwards is from the middle of the mask around the snout to the snout.
     """
@@ -266,7 +266,7 @@ def _looks(
     crop_camera: Camera,
     segmenter: Segmenter,
 ) -> tuple[list[UInt8[np.ndarray, "_ _ 3"]], list[SegmentedFish]]:
-    """The pictures of a crop that the segmenter sees, and what it finds, in the crop's pixels."""
+    """The pictures of a crop for the segmenter, and its results in the crop's pixels."""
     side_px = crop_camera.width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
     pictures, found = [], []
     for size_px in picture_sizes(side_px, view.settings.segmenter_sizes_px):
@@ -278,17 +278,17 @@ def _looks(
 
 
 def picture_sizes(side_px: float, sizes_px: Sequence[int]) -> list[int]:
-    """Those sizes of pictures, ascending, that a crop of `side_px` in the frame has pixels for.
+    """The picture sizes, ascending, that a crop of `side_px` in the frame has pixels for.
 
-    Enlarged pictures of small fish are cut out worse than small ones
-    (docs/research/real-pictures.md); the smallest size is always among them.
+    Enlarged pictures of small fish are segmented worse than small ones
+    (docs/research/real-pictures.md); the smallest size is always included.
     """
     smallest, *larger = sorted(sizes_px)
     return [smallest, *(size for size in larger if size <= side_px)]
 
 
 def _slope(values: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
-    """Along the first axis: what `np.gradient` gives, in half of its time."""
+    """Gradient along the first axis, as `np.gradient`, in half of its time."""
     slope = np.empty_like(values)
     slope[1:-1] = (values[2:] - values[:-2]) / 2
     slope[0], slope[-1] = values[1] - values[0], values[-1] - values[-2]
@@ -298,7 +298,7 @@ def _slope(values: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
 def mask_confidence(
     probability: Float32[np.ndarray, "S S"], mask: Bool[np.ndarray, "S S"]
 ) -> float:
-    """The IoU with the truth that nine in ten masks like this one reach; 0 for an empty mask."""
+    """The IoU with the truth that nine in ten masks of this confidence reach; 0 if empty."""
     return expected_iou(probability, mask) ** _CONFIDENCE_POWER
 
 
@@ -318,23 +318,23 @@ class Detection:
 
     source_id: int  # of its annotation file or of the tracker, the same in each frame
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
-    # Of the frame, or of a part with the whole fish; all False for an empty mask; None: the
+    # A mask of the frame, or of a part with the whole fish; all False if empty; None: the
     # segmenter is to find it.
     mask: Bool[np.ndarray, "h w"] | None
     visible_fraction: float  # 0 to 1
-    mask_corner: tuple[int, int] = (0, 0)  # frame pixel (x, y) of the mask's top left one
-    may_be_no_fish: bool = False  # found by a detector, and not yet known to be a fish
+    mask_corner: tuple[int, int] = (0, 0)  # frame pixel (x, y) of the mask's top left pixel
+    may_be_no_fish: bool = False  # found by a detector and not yet confirmed as a fish
     # Pixels that something in front of fish hides: neither fish nor water; None: no such pixel.
     unknown: Bool[np.ndarray, "H W"] | None = None
 
 
 NOT_NUMBERED = 0  # track ids begin with 1
 
-# Of masks in a view and in a wider one; those of simulated fish nearly always agree. See
+# IoU of the masks in a view and in a wider view; masks of simulated fish nearly always agree. See
 # docs/research/tracking.md.
 _MIN_AGREEMENT = 0.4
-# How far a box goes on beyond the ends and the sides of a fish, over its longer side; the least
-# IoU of the masks in both boxes that are of one fish; the most that the second one may add to the
+# How far a box extends beyond the ends and the sides of a fish, over its longer side; the least IoU
+# of the masks in both boxes, if they show one fish; the most that the second mask may add to the
 # length and take from the confidence, together. Chosen on photographs that the network never saw,
 # with boxes that lack an end and boxes that lack none (docs/research/real-pictures.md).
 _BEYOND_ENDS, _BEYOND_SIDES = 0.15, 0.045
@@ -352,8 +352,8 @@ def crop_fish(
 ) -> FishCrop:
     """One fish, seen through a crop camera around its box and its mask; not numbered yet.
 
-    Where the detection has no mask, the segmenter finds it in the crop. Whether it is a fish shows
-    in the mask, so only then `TrackNumbering` gives it a `track_id`.
+    If the detection has no mask, the segmenter finds it in the crop. The mask shows whether it is a
+    fish; only then does `TrackNumbering` assign a `track_id`.
     """
     view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
     if detection.mask is not None:
@@ -391,15 +391,15 @@ def crop_fish(
 
 
 def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
-    """A crop of what may be no fish: of little confidence where a wider view shows another mask.
+    """A crop of a doubtful fish, of little confidence if a wider view shows another mask.
 
-    An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. Seen
-    with them it is nothing, or a part of something larger. A label looks like one in both views,
-    but no fish fills a rectangle.
+    An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. In a
+    wider view it is nothing, or a part of something larger. A label looks like a fish in both
+    views, but no fish fills a rectangle.
     """
     if (crop.confidence or 0.0) < _MIN_AGREEMENT:
         return crop  # doubted already, and the wider view costs as much as a crop
-    # Of a fish that the picture cuts off, the trunk alone may fill one.
+    # The trunk of a fish that the picture cuts off may fill a rectangle.
     if is_rectangle(crop.mask) and not crop.touches_border(view):
         return replace(crop, confidence=0.0)
     wider = crop_wider(view, crop, segmenter)
@@ -409,16 +409,16 @@ def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedC
     if not view.settings.second_look or wider.extent is None:
         return crop
     second = crop_segmented(view, wider.extent, segmenter)
-    surer = max(crop, second, key=lambda one: one.confidence or 0.0)
-    # Whether it is a fish says the first look: the better of two would find more that are none.
+    surer = max(crop, second, key=lambda crop: crop.confidence or 0.0)
+    # The first look decides whether it is a fish: the better of two would accept more false ones.
     return replace(_lengthened(view, surer, segmenter), confidence=crop.confidence)
 
 
 def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
-    """The crop of a box that goes on beyond both ends, if the same fish is longer in it.
+    """The crop of a box that extends beyond both ends, if the same fish is longer in it.
 
-    A segmenter that is told where a fish is believes the box: where a box ends at the root of a
-    tail, the mask does, as sure as others. How far the ends move says how far they can be trusted.
+    A segmenter that is given a box trusts it: if the box ends at the root of the tail, so does the
+    mask, with no less confidence. The shift of the ends measures how far they can be trusted.
     """
     if crop.extent is None:
         return crop
@@ -428,13 +428,13 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
     beyond = np.concatenate([-share, share]) * sides.max()
     longer = _segment(view, np.concatenate([low, high]) + beyond, segmenter)
     if longer.is_cut or agreement(crop, longer) < _MIN_SAME_FISH:
-        return replace(crop, length_doubt=_BEYOND_ENDS)  # it may go on as far as was looked
+        return replace(crop, length_doubt=_BEYOND_ENDS)  # it may extend as far as was looked
     before, after = _end_to_end_px(view, crop, longer)
     change = after / before - 1
     lost = (crop.confidence or 0.0) - (longer.confidence or 0.0)
     if not 0 < change < _MAX_COST - lost:
         return replace(crop, length_doubt=abs(change))
-    # Where head and tail are says the first crop as well: a loose box says less of which is which.
+    # Which end is the head is decided by the first crop: a loose box is worse at that.
     ends, affine = crop.ends, _crop_to_crop(crop, longer)
     if ends is not None:
         head_px, tail_px = (affine[:, :2] @ p + affine[:, 2] for p in (ends.head_px, ends.tail_px))
@@ -443,7 +443,7 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
 
 
 def _crop_to_crop(crop: MaskedCrop, other: MaskedCrop) -> Float[np.ndarray, "2 3"]:
-    """The affine map from one crop's pixels to another's: their cameras look the same way."""
+    """The affine map from one crop's pixels to another's; both cameras look the same way."""
     return (other.crop_camera.K @ np.linalg.inv(crop.crop_camera.K))[:2]
 
 

@@ -23,7 +23,7 @@ _ALONG_EDGE = np.linspace(0, 1, _RAYS_PER_EDGE)
 
 
 def mask_bbox(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
-    """The box around a mask, half-open; None for an empty one."""
+    """The box around a mask, half-open; None if it is empty."""
     x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
     return np.array([x, y, x + width, y + height], np.float64) if width else None
 
@@ -98,7 +98,7 @@ class Layer(NamedTuple):
     """A picture or mask of the frame, or of a part of it outside of which it is 0."""
 
     image: UInt8[np.ndarray, "h w *_"] | Bool[np.ndarray, "h w"]
-    corner: tuple[int, int] = (0, 0)  # frame pixel of its top left one
+    corner: tuple[int, int] = (0, 0)  # frame pixel of its top left pixel
 
 
 def resample(
@@ -134,8 +134,8 @@ def frame_from_crop_map(
 ) -> tuple[Float32[np.ndarray, "N N"], Float32[np.ndarray, "N N"]]:
     """Frame x and y of `samples` x `samples` points in each crop pixel: `frame_from_crop` as a map.
 
-    OpenCV's map for undistortion is this very one, in 0.1 ms instead of 13 ms for 192 x 192; being
-    float32 it differs by at most 2e-4 px in frames up to 4096 px wide.
+    OpenCV's undistortion map gives the same in 0.1 ms instead of 13 ms for 192 x 192; as it is
+    float32, it differs by at most 2e-4 px in frames up to 4096 px wide.
     """
     fine = crop_camera.resized(crop_camera.width * samples)
     size = (fine.width, fine.height)
@@ -152,11 +152,11 @@ _OVEREXPOSED_LEVEL = 250  # grey level of every channel; brighter than any skin 
 def touches_border(
     extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...], pixel_px: float = 1.0
 ) -> bool:
-    """True where a mask is within a pixel of the edge of a frame of shape (H, W); None: False.
+    """True if a mask is within a pixel of the edge of a frame of shape (H, W); None: False.
 
     `extent`: the half-open box of the frame pixels with the centers of the mask's pixels, which are
-    `pixel_px` frame pixels wide: the mask goes half of one further. In a picture of 12 megapixels a
-    crop's pixel has 40.
+    `pixel_px` frame pixels wide: the mask extends half a mask pixel further. In a picture of 12
+    megapixels a mask pixel is 40 px wide.
     """
     if extent is None:
         return False
@@ -182,13 +182,13 @@ def sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) 
     return float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var())
 
 
-# Of the smallest rectangle around a mask: paper labels fill .85 to .90, of 30,000 masks of fish 4
-# that are twice as long as broad fill more than this (docs/research/tracking.md).
+# Share of the smallest rectangle around a mask. Paper labels fill .85 to .90; of 30,000 masks of
+# fish that are twice as long as broad, 4 fill more than this (docs/research/tracking.md).
 _RECTANGLE = 0.84
 
 
 def is_rectangle(mask: Bool[np.ndarray, "S S"]) -> bool:
-    """True for an oblong mask that fills its rectangle, corners too, as those of labels do."""
+    """True for an oblong mask that fills its rectangle with its corners, as labels do."""
     if not mask.any():
         return False
     breadth, length = sorted(cv2.minAreaRect(cv2.findNonZero(mask.view(np.uint8)))[1])

@@ -1,4 +1,4 @@
-"""Masks as other programs keep them: polygons, and COCO's run lengths.
+"""Convert masks to and from the formats of other programs: polygons and COCO's run lengths.
 
 Their coordinates are from the corner of the picture, so a pixel's centre is at one half.
 """
@@ -20,13 +20,13 @@ Part = Sequence[Ring]
 # are left for the rounding of other programs, so that each pixel stays inside or outside.
 _TOLERANCE_PX = 0.25
 _MAX_CORNER_PX = 1e6  # chosen: beyond every camera's picture
-_ON_LINE_PX = 0.01  # a pixel whose centre is as near to a line is inside
+_ON_LINE_PX = 0.01  # a pixel whose centre is so near to a line is inside
 
 
 def outlines_of(mask: Bool[np.ndarray, "H W"]) -> list[Part]:
-    """Polygons with few corners, of which `fill_parts` makes the same mask; the largest first."""
+    """Polygons with few corners from which `fill_parts` makes the same mask; the largest first."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    # With two pixels for one, a border pixel says by its parity on which side of it the border is.
+    # At double size, the parity of a border pixel shows on which side of it the border is.
     doubled = mask[y : y + height, x : x + width].astype(np.uint8).repeat(2, 0).repeat(2, 1)
     lines, tree = cv2.findContours(doubled, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     parts = dict[int, list[Ring]]()
@@ -40,10 +40,10 @@ def outlines_of(mask: Bool[np.ndarray, "H W"]) -> list[Part]:
 
 
 def fill_parts(shape: tuple[int, int], parts: Sequence[Part]) -> Bool[np.ndarray, "H W"]:
-    """The pixels of a picture of a shape whose centres are inside, or on the line.
+    """The mask of all pixels of a picture whose centres are inside, or on a line.
 
-    So an outline along the edges of pixels is as right as one through the centres of those at the
-    border, which OpenCV gives.
+    So it reads outlines along the edges of pixels as well as outlines through the centres of the
+    border pixels, which OpenCV gives.
     """
     mask, on_line = np.zeros(shape, bool), (-_ON_LINE_PX, _ON_LINE_PX)
     for part in parts:
@@ -75,7 +75,7 @@ def _between(rings: Part, shape: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
 
 
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """COCO's counts: pixels off, on, off, ... column by column, beginning with those off."""
+    """COCO's counts: pixels off, on, off, ... column by column, beginning with pixels off."""
     pixels = mask.ravel(order="F")
     changes = np.flatnonzero(np.diff(pixels)) + 1
     edges = np.concatenate([[0], changes, [len(pixels)]])
@@ -87,7 +87,7 @@ def ring_of(numbers: Any, *, where: str) -> Ring:
     """The corners of a polygon that a file gives as x, y, x, y, ...
 
     Raises AnnotationError, about the place `where`, for corners far from any picture, with which
-    the arithmetic would overflow; ValueError and TypeError for what is no list of corners.
+    the arithmetic would overflow; ValueError and TypeError if it is no list of corners.
     """
     ring = np.asarray_chkfinite(numbers, np.float64).reshape(-1, 2)
     if (far := np.abs(ring).max(initial=0.0)) > _MAX_CORNER_PX:
@@ -103,11 +103,12 @@ def decode_coco(
 ) -> Bool[np.ndarray, "H W"]:
     """The mask of COCO's `segmentation`, polygons or run lengths, in a picture of a shape.
 
-    Raises AnnotationError, about the place `where`, for another size or something else.
+    Raises AnnotationError, about the place `where`, for another size or another format.
     """
     try:
         if not isinstance(segmentation, dict):
-            return fill_parts(shape, [[ring_of(one, where=where)] for one in segmentation])
+            rings = [[ring_of(polygon, where=where)] for polygon in segmentation]
+            return fill_parts(shape, rings)
         counts = segmentation["counts"]
         runs = _unpack(counts) if isinstance(counts, str) else counts
         if sum(runs) == shape[0] * shape[1] and list(segmentation["size"]) == list(shape):

@@ -1,4 +1,4 @@
-"""Open a segmenter by its name; GrabCut is one, with no trained weights.
+"""Open a segmenter by its name, among them GrabCut, which has no trained weights.
 
 Rother, Kolmogorov, Blake: "GrabCut: interactive foreground extraction using iterated graph cuts",
 SIGGRAPH 2004. It follows colour, so shadows and lines may be taken for fish.
@@ -39,9 +39,9 @@ class GrabCutSegmenter:
 def segment_box(
     image: UInt8[np.ndarray, "H W 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
 ) -> Bool[np.ndarray, "H W"]:
-    """The fish in a box, as a mask of the whole image (BGR); empty where the box is too small.
+    """The fish in a box, as a mask of the whole image (BGR); empty if the box is too small.
 
-    Deterministic, and independent of every other frame.
+    Deterministic, and independent of all other frames.
     """
     mask = np.zeros(image.shape[:2], bool)
     # The box and its surroundings in whole pixels, half-open, inside the frame.
@@ -65,7 +65,7 @@ def segment_box(
 
 
 def _grab_cut(image: UInt8[np.ndarray, "h w 3"], box: np.ndarray) -> UInt8[np.ndarray, "h w"]:
-    """1 where GrabCut finds fish. Outside the box is background; its corners probably are."""
+    """1 for fish by GrabCut. Outside the box is background; its corners probably are."""
     height, width = image.shape[:2]
     x0, y0, x1, y1 = (int(v) for v in np.clip(box, 0, [width, height, width, height]))
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
@@ -84,7 +84,7 @@ def _grab_cut(image: UInt8[np.ndarray, "h w 3"], box: np.ndarray) -> UInt8[np.nd
 def open_segmenter(name: str) -> Segmenter:
     """The segmenter of a name, or of a path to an ONNX file or to weights (.pt).
 
-    Torch is imported only for weights. Raises ModelError for an unknown name, and where the file
+    Torch is imported only for weights. Raises ModelError for an unknown name, and if the file
     cannot be used.
     """
     if name == "grabcut":

@@ -1,9 +1,9 @@
 """A user's promptable model as an ONNX file: an image and a box in, a mask out.
 
 Inputs: the crop as (1, 3, H, W), RGB from 0 to 1, and its box, either as one input of four numbers
-(x0, y0, x1, y1 in input pixels), or as the Segment Anything family takes it (Kirillov et al.,
-ICCV 2023): two points with the labels 2 and 3. Outputs: logits (..., h, w) of one or more masks,
-and where there are more, a second output with a score for each.
+(x0, y0, x1, y1 in input pixels), or as in the Segment Anything family (Kirillov et al., ICCV 2023):
+two points with the labels 2 and 3. Outputs: logits (..., h, w) of one or more masks; with more than
+one mask, a second output with a score for each.
 """
 
 from pathlib import Path
@@ -73,17 +73,17 @@ class PromptableSegmenter:
     def _read_inputs(self) -> tuple[str, dict[str, tuple[int, ...]]]:
         """The name of the image input, and the shape of one box in each prompt input."""
         pictures, prompts = [], {}
-        for one in self._session.get_inputs():
-            if len(one.shape) == 4 and one.shape[1] == 3:
-                pictures.append(one.name)
+        for given in self._session.get_inputs():
+            if len(given.shape) == 4 and given.shape[1] == 3:
+                pictures.append(given.name)
                 continue
-            last = 2 if "label" in one.name.lower() else one.shape[-1] if one.shape else 0
+            last = 2 if "label" in given.name.lower() else given.shape[-1] if given.shape else 0
             sizes = {"box": (4,), "label": (2,), "point": (2, 2), "coord": (2, 2)}
-            kind = next((kind for kind in sizes if kind in one.name.lower()), None)
-            if kind is None or last != sizes[kind][-1] or len(one.shape) < len(sizes[kind]):
-                raise self._refusal("inputs for a picture and a box", f"{one.name} {one.shape}")
-            ones = (1,) * (len(one.shape) - len(sizes[kind]))
-            prompts[one.name] = (*ones, *sizes[kind])
+            kind = next((kind for kind in sizes if kind in given.name.lower()), None)
+            if kind is None or last != sizes[kind][-1] or len(given.shape) < len(sizes[kind]):
+                raise self._refusal("inputs for a picture and a box", f"{given.name} {given.shape}")
+            ones = (1,) * (len(given.shape) - len(sizes[kind]))
+            prompts[given.name] = (*ones, *sizes[kind])
         if len(pictures) != 1 or not prompts:
             names = ", ".join(f"{i.name} {i.shape}" for i in self._session.get_inputs()) or "none"
             raise self._refusal("one input (1, 3, H, W) and one for a box", names)

@@ -1,7 +1,7 @@
 """The interface of a segmenter: an image and a box in, a mask out.
 
 A segmenter sees a picture of the crop, not the frame. A crop is free of lens distortion, and its
-pixel map to the frame is in one place (`masks.crop_geometry`), so that a segmenter needs no camera.
+pixel map to the frame is in one place (`crop_geometry`), so that a segmenter needs no camera.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class SegmentedFish:
     ends: FishEnds | None  # None from a segmenter that does not locate them
 
     def resized(self, size_px: int) -> "SegmentedFish":
-        """The same fish in a crop of another size; pixel edges stay where they are."""
+        """The same fish in a crop of another size; pixel edges keep their places."""
         scale, ends = size_px / len(self.probability), self.ends
         if ends is not None:
             head_px, tail_px = ((p + 0.5) * scale - 0.5 for p in (ends.head_px, ends.tail_px))
@@ -33,7 +33,7 @@ class SegmentedFish:
 
 
 def resize(picture: np.ndarray, size_px: int) -> np.ndarray:
-    """A square picture in another size; pixel edges stay where they are, not pixel centers."""
+    """A square picture in another size; pixel edges keep their places, pixel centers don't."""
     if len(picture) == size_px:
         return picture
     interpolation = cv2.INTER_AREA if len(picture) > size_px else cv2.INTER_LINEAR
@@ -46,7 +46,7 @@ class Segmenter(Protocol):
 
     @property
     def knows_fish(self) -> bool:
-        """True where what is no fish gets no mask; False where whatever fills the box gets one."""
+        """True if only fish get a mask; False if anything in the box gets a mask."""
         ...
 
     def segment(

@@ -20,8 +20,8 @@ from stream_dmr.messages import FishCrop
 from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.species import CODE
 
-_DEFAULT_SIDE_PX = 128  # for a model that takes pictures of any size: that of a crop
-_MIN_VISIBLE = 0.5  # of a fish that is looked at; chosen
+_DEFAULT_SIDE_PX = 128  # that of a crop, for a model that takes pictures of any size
+_MIN_VISIBLE = 0.5  # of a fish that is classified; chosen
 
 
 class SpeciesClassifier:

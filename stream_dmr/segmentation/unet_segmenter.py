@@ -35,7 +35,7 @@ def find_ends(maps: Float32[np.ndarray, "2 s s"]) -> FishEnds:
     `maps` are log probabilities of head and tail per cell. The odds against the two being swapped
     are p_h(H) p_t(T) / (p_h(T) p_t(H)).
     """
-    cells = [cell for one in maps for cell in _peaks(one)]
+    cells = [cell for log_probability in maps for cell in _peaks(log_probability)]
     value, head, tail = max(
         (float(maps[0][h] + maps[1][t]), h, t)
         for h, t in permutations(cells, 2)
@@ -49,7 +49,7 @@ def find_ends(maps: Float32[np.ndarray, "2 s s"]) -> FishEnds:
 
 
 def _peaks(log_probability: Float32[np.ndarray, "s s"]) -> list[tuple[int, int]]:
-    """Row and column of the highest cell, and of the highest one away from it."""
+    """Row and column of the highest cell, and of the highest cell away from it."""
     row, column = divmod(int(log_probability.argmax()), len(log_probability))
     away = log_probability.copy()
     top, left = max(0, row - _NEAR), max(0, column - _NEAR)
@@ -87,7 +87,7 @@ class UNetSegmenter:
     def load(cls, path: Path) -> "UNetSegmenter":
         """The network of an ONNX file, or of weights (.pt), which imports torch to convert them.
 
-        Raises ModelError where the file cannot be used.
+        Raises ModelError if the file cannot be used.
         """
         content = _convert(path) if path.suffix.lower() == ".pt" else None
         session = open_session(path, content=content, threads=_THREADS)
@@ -119,7 +119,7 @@ class UNetSegmenter:
     ) -> tuple[Float32[np.ndarray, "B H W"], Float32[np.ndarray, "B 2 h w"]]:
         """Probabilities of fish, and log probabilities of head and tail at a quarter of the size.
 
-        H and W are multiples of SIZE_MULTIPLE_PX. `in_boxes` are from `box_coverage`; where it is 1
+        H and W are multiples of SIZE_MULTIPLE_PX. `in_boxes` are from `box_coverage`; if it is 1
         everywhere, all fish in the image are found.
         """
         feed = {IMAGES_INPUT: np.ascontiguousarray(images), BOXES_INPUT: in_boxes}
