@@ -25,13 +25,13 @@ from stream_dmr.errors import CalibrationError
 from stream_dmr.files import make_folder, writing_to
 
 _SAME_VIEW = 0.01  # of the picture's diagonal, chosen: closer boards add no information
-# Of the picture's longer side; chosen: a lens that is another's is worse.
+# Of the picture's longer side; chosen: the lens of another camera is worse.
 _GOOD_PLANE_RMS = 1 / 1000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardResult:
-    """The calibration and what is needed to judge it."""
+    """The calibration and the figures to judge it by."""
 
     calibration: Calibration
     board: PrintedBoard
@@ -39,7 +39,7 @@ class BoardResult:
     plane_view: BoardView  # the view whose board lies in the reference plane
     left_out: tuple[LeftOut, ...]
     warnings: tuple[str, ...]
-    model_note: str  # why the lens is a fisheye; "" where nothing was chosen
+    model_note: str  # why the lens is a fisheye; "" if nothing was chosen
 
 
 def calibrate(
@@ -52,11 +52,11 @@ def calibrate(
     """Calibrate the camera from all pictures, and the reference plane from `plane_image`.
 
     In `plane_image` the board lies in the reference plane; that picture serves for the lens as
-    well, listed among `image_paths` or not. Zhang, "A Flexible New Technique for Camera
-    Calibration", PAMI 2000, as OpenCV does it.
+    well, listed among `image_paths` or not. After Zhang, "A Flexible New Technique for Camera
+    Calibration", PAMI 2000, as in OpenCV.
 
-    Raises CalibrationError where the plane's picture is unusable, fewer than MIN_VIEWS pictures
-    show the board, or the views are too much alike to determine the focal length.
+    Raises CalibrationError if the plane's picture is unusable, fewer than MIN_VIEWS pictures show
+    the board, or the views are too much alike to determine the focal length.
     """
     plane_image, board = Path(plane_image), board or PrintedBoard()
     found, size, left_out = _find_boards(image_paths, plane_image, board)
@@ -78,9 +78,9 @@ def calibrate(
 def calibrate_plane(
     plane_image: Path | str, lens: LensFile, board: PrintedBoard
 ) -> tuple[Calibration, BoardView]:
-    """The reference plane from one picture of a camera whose lens is known already.
+    """The reference plane from one picture of a camera with a known lens.
 
-    Raises CalibrationError where the picture is of another size, shows no board, or shows one that
+    Raises CalibrationError if the picture is of another size, shows no board, or shows a board that
     does not fit this lens.
     """
     path = Path(plane_image)
@@ -104,7 +104,7 @@ def calibrate_plane(
 def draw_views(result: BoardResult, folder: Path) -> None:
     """Write a picture of each view with its corners drawn, for a check by eye.
 
-    Raises OutputError where the folder can't be written to.
+    Raises OutputError if the folder can't be written to.
     """
     with writing_to(make_folder(folder)):
         for number, view in enumerate(result.fit.views, start=1):
@@ -115,7 +115,7 @@ def draw_views(result: BoardResult, folder: Path) -> None:
 def _find_boards(
     image_paths: Iterable[Path | str], plane_image: Path, board: PrintedBoard
 ) -> tuple[dict[Path, BoardCorners], tuple[int, int], list[LeftOut]]:
-    """Corners by picture, the plane's first; their (width, height); those left out."""
+    """Corners by picture, the plane's first; their (width, height); the pictures left out."""
     picture, plane_corners = _plane_corners(plane_image, board)
     size = (picture.shape[1], picture.shape[0])
     corners, left_out, seen = {plane_image: plane_corners}, [], {plane_image.resolve()}
@@ -177,7 +177,7 @@ _LEAST_FOCAL_MM, _LARGEST_FOCAL_MM = 8, 1000  # wider lenses are no pinholes
 def camera_of_focal_35mm(focal_mm: float, *, width: int, height: int) -> Camera:
     """The pinhole of a focal length as on 35 mm film, by the picture's diagonal.
 
-    Raises CalibrationError where no pinhole has it.
+    Raises CalibrationError if no pinhole has it.
     """
     if not _LEAST_FOCAL_MM <= focal_mm <= _LARGEST_FOCAL_MM:
         raise CalibrationError(

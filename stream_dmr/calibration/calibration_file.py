@@ -28,15 +28,15 @@ _MAX_ANGLE = 2 * np.pi + 1e-6
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read and check a calibration file, in any notation that `calibration_values` knows.
+    """Read and check a calibration file, in any notation that `calibration_values` reads.
 
-    Raises CalibrationError where the file is missing, is none, lacks a key, holds a value of the
-    wrong shape or out of range, has no plane, or has it behind the camera.
+    Raises CalibrationError if the file is missing, is no calibration, lacks a key, holds a value of
+    the wrong shape or out of range, has no plane, or has it behind the camera.
     """
     path = Path(path)
     values = with_common_names(read_values(path))
     if not any(key in values for key in _PLANE_KEYS):
-        load_lens(path)  # or it says what else is wrong
+        load_lens(path)  # raises if something else is wrong
         raise CalibrationError(
             f"{path}: expected a lens and a reference plane (rvec, tvec), got a lens alone; add "
             f"the plane: `stream-dmr calibrate --lens {path} --plane PICTURE --out NEW.yaml`, with "
@@ -65,7 +65,7 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
     """Write a calibration file that `load_calibration` and OpenCV read.
 
     The numbers are read back bit by bit, except for the plane's rotation, which is stored as a
-    rotation vector (error below 1e-12). Raises OutputError where the file can't be written.
+    rotation vector (error below 1e-12). Raises OutputError if the file can't be written.
     """
     path = Path(path)
     camera, plane = calibration.camera, calibration.plane

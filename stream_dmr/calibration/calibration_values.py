@@ -1,7 +1,7 @@
-"""Reads the named values of a calibration file, in whichever notation it is written.
+"""Read the named values of a calibration file in any of several notations.
 
 OpenCV's FileStorage (YAML, XML), JSON, other YAML, NumPy's .npz, and the bare numbers of KWIVER's
-KRTD. What the names mean is `lens_file`'s part.
+KRTD. `lens_file` interprets the names.
 """
 
 import json
@@ -31,14 +31,14 @@ _STORED_NAMES = (
     *("camera_matrix", "Camera_Matrix", "distortion_coefficients", "Distortion_Coefficients"),
     *("distortion_model", "fisheye_model", "rvec", "tvec"),
 )
-_MAX_NESTING = 200  # chosen: those that are known have three levels
+_MAX_NESTING = 200  # chosen: known files have three levels
 _KRTD_NUMBERS = 9 + 9 + 3 + 1  # K, R, t, and one coefficient or more
 
 
 def read_values(path: Path) -> Values:
-    """What a calibration file says, by name; OpenCV's matrices as arrays.
+    """The values of a calibration file by name; OpenCV's matrices as arrays.
 
-    Raises CalibrationError where it can't be read or is in none of these notations.
+    Raises CalibrationError if it can't be read or is in none of these notations.
     """
     try:
         content = read_small(path)
@@ -74,7 +74,7 @@ def _stored(text: str, path: Path) -> Values:
 def _node_value(node: cv2.FileNode) -> float | str | Float[np.ndarray, "..."] | None:
     """A number, a text, an !!opencv-matrix, or OpenCV 5's vector with `sizes`; else None.
 
-    Read number by number: `FileNode.mat` writes out of bounds where the data don't match the size.
+    Read number by number: `FileNode.mat` writes out of bounds if the data don't match the size.
     """
     if node.isInt() or node.isReal():
         return node.real()
@@ -103,7 +103,7 @@ def _numbers(node: cv2.FileNode) -> list[float] | None:
 
 
 def _parsed(text: str, path: Path) -> Values:
-    """JSON, or YAML without OpenCV's head and aliases: a few of those can fill the memory."""
+    """JSON, or YAML without OpenCV's head and aliases, a few of which can fill the memory."""
     try:
         if text.lstrip().startswith("{"):
             values = json.loads(text)
@@ -135,7 +135,7 @@ def _krtd(text: str) -> Values | None:
 
 def _npz(content: bytes, path: Path) -> Values:
     try:
-        with zipfile.ZipFile(BytesIO(content)) as archive:  # what is packed may be any size
+        with zipfile.ZipFile(BytesIO(content)) as archive:  # its content may be of any size
             if sum(part.file_size for part in archive.infolist()) > MAX_TEXT_BYTES:
                 raise _no_calibration(path, f"an .npz of more than {MAX_TEXT_BYTES // 1000} kB")
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
@@ -164,18 +164,18 @@ def _no_calibration(path: Path, got: str) -> CalibrationError:
 _GRID = 41  # places along each side of the picture
 _MAX_ROUND_TRIP_PX = 1.0
 _STEP = 1e-5  # of X and Y, for derivatives
-# Chosen: corners may be folded, where no board was seen and polynomials do as they like; a port of
+# Chosen: corners without a board may be folded, since polynomials are free there; a port of
 # flat glass under water enlarges small areas 40 degrees off the axis by 5.
 _MAX_SHARE = 0.05
 _MAX_ENLARGEMENT = 6.0
 
 
 def require_lens(camera: Camera, path: Path) -> None:
-    """Raise CalibrationError where a pinhole's distortion can't be a lens's.
+    """Raise CalibrationError if no real lens can have a pinhole's distortion.
 
     Within the ellipse that touches the picture's sides nearly every pixel must have a ray of its
-    own, that leads back to it: a distortion whose radius shrinks further out folds the picture. And
-    none may show small areas much larger than the middle does.
+    own, which leads back to it: a distortion whose radius shrinks further out folds the picture.
+    And no place may show small areas much larger than the middle does.
     """
     if camera.is_fisheye:  # rays end where its model folds
         return
@@ -200,7 +200,7 @@ def require_lens(camera: Camera, path: Path) -> None:
 
 
 def _enlargements(rays: Float[np.ndarray, "N 3"], camera: Camera) -> Float[np.ndarray, "N"]:
-    """Areas in the picture over those that a lens without distortion would show.
+    """Areas in the picture over their areas by a lens without distortion.
 
     The determinant of the derivative of pixels by (X, Y), over the focal lengths.
     """

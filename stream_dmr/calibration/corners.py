@@ -1,9 +1,9 @@
 """Find the inner corners of chessboards and ChArUco boards, and print such boards.
 
-A ChArUco board is a chessboard with a marker in each white square, which say which corner is which
-(Garrido-Jurado et al., Pattern Recognition 2014; OpenCV's `CharucoDetector`): a part in view is
-enough. Which dictionary the markers are of, and whether the first square is black or white (OpenCV
-4.6 turned that round), is found out.
+A ChArUco board is a chessboard with a marker in each white square that identifies its corners
+(Garrido-Jurado et al., Pattern Recognition 2014; OpenCV's `CharucoDetector`), so a part in view is
+enough. The markers' dictionary is found out, and whether the first square is black or white (OpenCV
+4.6 changed that).
 """
 
 import re
@@ -22,12 +22,12 @@ from stream_dmr.pictures import read_picture, size_if_huge
 Board = tuple[int, int]  # inner corners a row, and a column
 
 # The board is searched in a copy of this size, so that large photographs take no longer than small
-# ones; squares down to some 6 px of the copy are found.
+# photographs; squares down to some 6 px of the copy are found.
 _SEARCH_SIDE_PX = 1280
 # Half the window of the sub-pixel search, in squares: as large as possible without including the
 # next corners. On rendered views 0.15 had twice the error of 0.4, and ten times when blurred.
 _WINDOW_SQUARES = 0.4
-_MAX_WINDOW_PX = 30  # larger ones took longer and were not more accurate
+_MAX_WINDOW_PX = 30  # larger windows took longer and were not more accurate
 _STOP_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 _DRAWN_SIDE_PX = 1600
 
@@ -35,7 +35,7 @@ _DRAWN_SIDE_PX = 1600
 def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
     """Read a picture in sensor orientation: grey, 8 bit, EXIF rotation ignored.
 
-    Raises CalibrationError where the file can't be read, is no picture, or one that is too large.
+    Raises CalibrationError if the file can't be read, is no picture, or is too large.
     """
     if huge := size_if_huge(path):
         raise CalibrationError(f"{path}: too large: {huge}")
@@ -51,12 +51,12 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
 def find_corners(
     picture: UInt8[np.ndarray, "H W"], board: Board
 ) -> Float[np.ndarray, "N 2"] | None:
-    """Sub-pixel inner corners in px, row by row; None where no whole board is found.
+    """Sub-pixel inner corners in px, row by row; None if no whole board is found.
 
     The sector-based detector (Duda and Frese, "Accurate Detection and Localization of Checkerboard
     Corners for Calibration", BMVC 2018) finds them in a small copy; `cornerSubPix` then refines
     them in the picture itself. The first corner is the one nearest the picture's top-left and the
-    board's Z points away from the camera, in whichever order the detector returns them.
+    board's Z points away from the camera, in any order that the detector returns them.
     """
     scale = max(1.0, max(picture.shape) / _SEARCH_SIDE_PX)
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -79,7 +79,7 @@ def seen_board(picture: UInt8[np.ndarray, "H W"]) -> Board | None:
 def draw_corners(path: Path, corners: Float[np.ndarray, "N 2"], board: Board, out: Path) -> None:
     """Write the picture at `path`, reduced if large, with its corners drawn, to `out`.
 
-    Lines join them where all of the board's are there.
+    Lines join them if all corners of the board are there.
     """
     picture = read_grey(path)
     scale = max(1.0, max(picture.shape) / _DRAWN_SIDE_PX)
@@ -123,7 +123,7 @@ def _in_order(corners: Float[np.ndarray, "N 2"], board: Board) -> Float[np.ndarr
 
 Markers = tuple[Float[np.ndarray, "M 4 2"], Int[np.ndarray, "M"]]  # corners in px, and ids
 
-# The largest of each size: the smaller ones are its first markers.
+# The largest of each size: the smaller dictionaries are its first markers.
 _DICTIONARIES = (
     *(cv2.aruco.DICT_4X4_1000, cv2.aruco.DICT_5X5_1000, cv2.aruco.DICT_6X6_1000),
     *(cv2.aruco.DICT_7X7_1000, cv2.aruco.DICT_ARUCO_ORIGINAL),
@@ -131,14 +131,14 @@ _DICTIONARIES = (
 )
 # Chosen: six corners in two rows or more fix the pose of a plane with something to spare.
 _MIN_CORNERS, _MIN_MARKERS = 6, 3
-_MAX_SQUARES = 30  # a side, of a board that is only recognised
+_MAX_SQUARES = 30  # a side, of a board of unknown size
 # Markers of the right board lie on its grid but for the lens: on a dome, at the picture's edge, a
-# quarter of a square off a common homography; those of another width lie squares off.
+# quarter of a square off a common homography; markers of another width lie squares off.
 _MAX_OFF_SQUARES = 0.5
 
 
 class CharucoFinder:
-    """Finds one board in pictures; it looks first for the markers that it saw last."""
+    """Finds one board in pictures, beginning with the markers that it saw last."""
 
     def __init__(self, inner: Board, *, marker_share: float) -> None:
         """`inner` counts inner corners, `marker_share` is the side of a marker in squares."""
@@ -148,7 +148,7 @@ class CharucoFinder:
     def find(
         self, picture: UInt8[np.ndarray, "H W"]
     ) -> tuple[Float[np.ndarray, "N 2"], Int[np.ndarray, "N"]] | None:
-        """Sub-pixel inner corners in px and their numbers, row by row; None where too few are."""
+        """Sub-pixel inner corners in px and their numbers, row by row; None if too few are seen."""
         squares = (self._inner[0] + 1, self._inner[1] + 1)
         for dictionary, markers in self._seen_markers(picture):
             board = _fitting_board(markers, [squares], dictionary, self._marker_share)
@@ -167,7 +167,7 @@ class CharucoFinder:
         The rows are as many as the highest marker in view needs.
         """
         for dictionary, markers in self._seen_markers(picture):
-            needed = 2 * (int(markers[1].max()) + 1)  # squares; every other one has a marker
+            needed = 2 * (int(markers[1].max()) + 1)  # squares; every second square has a marker
             sizes = [(n, max(2, -(-needed // n))) for n in range(3, _MAX_SQUARES + 1)]
             board = _fitting_board(markers, sizes, dictionary, self._marker_share)
             if board is not None:
@@ -188,7 +188,7 @@ class CharucoFinder:
 def _fitting_board(
     markers: Markers, sizes: Sequence[Board], dictionary: int, marker_share: float
 ) -> cv2.aruco.CharucoBoard | None:
-    """The board among those sizes on whose grid the markers lie best; None: on none."""
+    """The board among those sizes on whose grid the markers lie best; None if on no grid."""
     known = cv2.aruco.getPredefinedDictionary(dictionary)
     best, least = None, _MAX_OFF_SQUARES
     for size in sizes:
@@ -210,18 +210,18 @@ def _off_squares(markers: Markers, board: cv2.aruco.CharucoBoard) -> float:
     points = np.array(board.getObjPoints())[[places[int(number)] for number in ids], :, :2]
     seen, flat = corners.reshape(-1, 2), points.reshape(-1, 2).astype(np.float64)
     homography, _ = cv2.findHomography(seen, flat)
-    if not np.all(np.isfinite(np.asarray(homography, np.float64))):  # None where there is none
+    if not np.all(np.isfinite(np.asarray(homography, np.float64))):  # None if there is none
         return np.inf
     mapped = cv2.perspectiveTransform(seen.reshape(-1, 1, 2).astype(np.float64), homography)
     return float(np.sqrt(np.mean(np.sum((mapped.reshape(-1, 2) - flat) ** 2, axis=1))))
 
 
 def _numbers(ids: object) -> Int[np.ndarray, "N"]:
-    """OpenCV's list of ids, which is None where nothing was found."""
+    """OpenCV's list of ids, which is None if nothing was found."""
     return np.zeros(0, np.int64) if ids is None else np.asarray(ids, np.int64).ravel()
 
 
-_SQUARES_MM = (1.0, 1000.0)  # chosen: what is outside of them is in m, or a slip
+_SQUARES_MM = (1.0, 1000.0)  # chosen: other values are in m, or a slip
 _CHARUCO = "charuco:"
 
 
@@ -262,7 +262,7 @@ class PrintedBoard:
 
     @classmethod
     def parse(cls, text: str, *, square_mm: float, marker_mm: float | None) -> "PrintedBoard":
-        """Read "9x6", inner corners of a chessboard, or "charuco:7x5", squares as those are named.
+        """Read "9x6", inner corners of a chessboard, or "charuco:7x5", squares of a ChArUco board.
 
         Raises CalibrationError for anything else.
         """
@@ -279,7 +279,7 @@ class PrintedBoard:
 
     @property
     def name(self) -> str:
-        """As `--board` takes it."""
+        """The board as `--board` takes it."""
         if self.marker_mm is None:
             return "{}x{}".format(*self.inner)
         return _CHARUCO + "{}x{}".format(*(count + 1 for count in self.inner))
@@ -292,7 +292,7 @@ class PrintedBoard:
         return points.reshape(-1, 3) * float(self.square_mm)
 
     def find(self, picture: UInt8[np.ndarray, "H W"]) -> BoardCorners | None:
-        """The corners in a picture; None where the board, or enough of a ChArUco board, is not."""
+        """The corners in a picture; None without the board, or enough of a ChArUco board."""
         if self.marker_mm is None:
             pixels = find_corners(picture, self.inner)
             return None if pixels is None else BoardCorners(pixels=pixels, points_mm=self.points_mm)
@@ -303,7 +303,7 @@ class PrintedBoard:
         return BoardCorners(pixels=pixels, points_mm=self.points_mm[ids])
 
     def not_found(self, picture: UInt8[np.ndarray, "H W"]) -> str:
-        """What to say of a picture without this board: with another one's size, if it shows one."""
+        """The message for a picture without this board, with the size of another board in it."""
         if self.marker_mm is None:
             counted, other = "inner corners", seen_board(picture)
         else:

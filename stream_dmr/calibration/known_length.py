@@ -1,4 +1,4 @@
-"""Measures what has a known length in the reference plane: a chessboard, or a rod by its ends."""
+"""Measure a known length in the reference plane: a chessboard, or a rod by its ends."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class ScaleError:
 
     known_mm: float  # the longest of them
     error_mm: float  # of the longest
-    error_percent: float  # mean over all, with its sign: what a wrong scale shows as
+    error_percent: float  # mean over all, with its sign: a wrong scale shows here
     worst_percent: float  # the largest, absolute
 
 

@@ -21,8 +21,8 @@ def find_plane(corners: BoardCorners, camera: Camera) -> tuple[ReferencePlane, f
     """The board's plane, and the RMS reprojection error in px.
 
     A planar target has a second, mirrored pose of almost the same error; IPPE (Collins and
-    Bartoli, IJCV 2014) gives both from the rays, whatever the lens, and the one with the smaller
-    error in the picture after refinement is taken.
+    Bartoli, IJCV 2014) gives both from the rays, for any lens. The pose with the smaller error in
+    the picture after refinement is taken.
     """
     rays = np.ascontiguousarray(camera.back_project(corners.pixels)[:, :2])
     _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
@@ -35,7 +35,7 @@ def find_plane(corners: BoardCorners, camera: Camera) -> tuple[ReferencePlane, f
 def _refined(
     start: Float[np.ndarray, "6"], corners: BoardCorners, camera: Camera
 ) -> tuple[ReferencePlane, float]:
-    """The pose of least reprojection error near one: rotation vector and translation."""
+    """The pose of least reprojection error near a start: rotation vector and translation."""
 
     def off_px(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "R"]:
         points = Rotation.from_rotvec(pose[:3]).apply(corners.points_mm) + pose[3:]
@@ -49,7 +49,7 @@ def _refined(
 
 MAX_FOCAL_STD = 0.01  # of the focal length; chosen: the views determine it within 1 %
 # Between the normals of the two most different boards. The std alone is not enough: ten boards, all
-# parallel to the sensor, fit any focal length equally well; one was 54 % wrong, its std 0.01 %.
+# parallel to the sensor, fit any focal length equally well; one fit was 54 % wrong, its std 0.01 %.
 MIN_TILT_DEG = 10.0
 _FISHEYE_FLAGS = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
 _FISHEYE_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
@@ -108,7 +108,7 @@ def fit_lens(
     only where it is 3 of its standard deviations from zero: fitted to noise, it would distort the
     picture's edges, where no board was seen. That of a fisheye is k1 k2 k3 k4.
 
-    Raises CalibrationError where the views leave the focal length undetermined.
+    Raises CalibrationError if the views leave the focal length undetermined.
     """
     fit = _fit_fisheye if is_fisheye else _fit_pinhole
     camera, focal_std_px = fit(list(boards.values()), size)
@@ -196,7 +196,7 @@ def _fisheye_stds(
     distortion: Float[np.ndarray, "4"],
     poses: "list[tuple[np.ndarray, np.ndarray]]",
 ) -> Float[np.ndarray, "8"]:
-    """Standard deviations of fx fy cx cy k1 k2 k3 k4, which `cv2.fisheye.calibrate` does not give.
+    """Standard deviations of fx fy cx cy k1 k2 k3 k4, which `cv2.fisheye.calibrate` doesn't return.
 
     sigma^2 (J^T J)^-1, the poses of the boards eliminated by the Schur complement.
     """
@@ -255,7 +255,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChosenFit:
-    """A lens, the views that do not agree with it, and what is to be said of the choice."""
+    """A lens, the views that do not agree with it, and notes on the choice."""
 
     fit: LensFit
     outliers: tuple[LeftOut, ...]
@@ -269,11 +269,10 @@ def choose_fit(
     plane_image: Path,
     model: LensModel,
 ) -> ChosenFit:
-    """Fit a lens of the model that is asked for.
+    """Fit a lens of the requested model.
 
-    "auto" takes the fisheye where it fits clearly better than the pinhole. Raises
-    CalibrationError where the views determine no lens, or the plane's picture disagrees with the
-    others.
+    "auto" takes the fisheye if it fits clearly better than the pinhole. Raises CalibrationError if
+    the views determine no lens, or if the plane's picture disagrees with the others.
     """
     if model != "auto":
         return _without_outliers(boards, size, plane_image, is_fisheye=model == "fisheye")
@@ -289,7 +288,7 @@ def choose_fit(
 
 
 def require_views(boards: int, left_out: list[LeftOut]) -> None:
-    """Raise CalibrationError where too few views are left."""
+    """Raise CalibrationError if too few views are left."""
     if boards >= MIN_VIEWS:
         return
     shown = [f"{left.path.name}: {left.reason}" for left in left_out[:5]]
@@ -381,7 +380,7 @@ def _is_bad(fit: LensFit) -> bool:
 
 
 def _folds_over(fit: LensFit) -> bool:
-    """True where the rays through the picture's corners are not seen in its corners."""
+    """True if the rays through the picture's corners are not seen in its corners."""
     camera = fit.camera
     right, bottom = camera.width - 1, camera.height - 1
     rim = np.array([[0, 0], [right, 0], [0, bottom], [right, bottom]], np.float64)

@@ -36,15 +36,15 @@ _SIDES = {"left": "L", "right": "R"}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LensFile:
-    """What a file says of one lens, checked."""
+    """The checked values of one lens in a file."""
 
     K: Float[np.ndarray, "3 3"]
     distortion: Float[np.ndarray, "D"]
     is_fisheye: bool
-    size: tuple[int, int] | None  # width, height; None: it doesn't say
+    size: tuple[int, int] | None  # width, height; None if the file has none
 
     def camera(self, size: tuple[int, int]) -> Camera:
-        """The camera for pictures of its own size, or of this one where it has none."""
+        """The camera for pictures of its own size, or of the given size if it has none."""
         width, height = self.size or size
         return Camera(
             width=width,
@@ -56,7 +56,7 @@ class LensFile:
 
 
 def load_lens(path: Path | str, *, name: str | None = None) -> LensFile:
-    """Read the lens of a file; `name` says which of several, such as left or cam0.
+    """Read the lens of a file; `name` selects one of several, such as left or cam0.
 
     Raises CalibrationError.
     """
@@ -120,7 +120,7 @@ def read_array(
 
 
 def with_common_names(values: Values) -> Values:
-    """The same, with the names that OpenCV's samples have now instead of their earlier ones."""
+    """The same values, by the present names of OpenCV's samples instead of earlier names."""
     names = ("image_Width", "image_Height", "Camera_Matrix", "Distortion_Coefficients")
     return {name.lower() if name in names else name: value for name, value in values.items()}
 

@@ -13,7 +13,7 @@ from stream_dmr.errors import TemplateError
 from stream_dmr.template.template import CENTER, JOINTS
 
 _LENGTH_PX = 1600  # that a fish is resampled to: finer than a photograph's outline needs
-_MARGIN_PX = 400  # for what lies beyond snout and fork: lobes up to a quarter of the length
+_MARGIN_PX = 400  # beyond snout and fork, for lobes up to a quarter of the length
 _SMOOTH_PX = 4.0  # chosen: 0.25 % of the length, against the steps between pixels
 # The remaining limits are chosen.
 _MIN_FISH_PX = 100  # along the fish; half a pixel is then 0.5 % of the length
@@ -24,8 +24,8 @@ _BOW_WINDOW = 0.3  # averaged over this part of the length, since fins stand out
 # A tail fin is broader than the peduncle before it: by a factor of 3.7 for the bundled halibut and
 # 2.3 for the pike; towards a snout no outline of theirs becomes broader.
 _MIN_SPREAD = 1.25
-# Between an outline and the one turned by half, of its area: 0.07 for the bundled eel, which has no
-# such fin, 0.3 and more for others and views from above; a drawn ellipse has 0.01 to 0.03.
+# Share of the area between an outline and the outline turned by half: 0.07 for the bundled eel,
+# which has no such fin, 0.3 and more for others and views from above; 0.01 to 0.03 for an ellipse.
 _MIN_DIFFERENCE = 0.04
 _TAIL_PART = 0.4  # of the length, in which a peduncle lies
 _TIP_PART = 0.01  # of the length, next to an end, whose middle is the tip
@@ -35,7 +35,7 @@ _TIP_PART = 0.01  # of the length, next to an end, whose middle is the tip
 class FishOutline:
     """Edges of a fish in lengths from snout to fork: x from the snout, y across the line.
 
-    The upper edge is the one with the smaller row numbers when the head is on the left.
+    The upper edge has the smaller row numbers when the head is on the left.
     """
 
     head_px: Float[np.ndarray, "2"]  # snout and fork in the mask's pixels (x, y), centres integers
@@ -43,7 +43,7 @@ class FishOutline:
     x: Float[np.ndarray, "N"]  # from 0 to the end of the longer lobe
     upper: Float[np.ndarray, "N"]  # distances of the edges from the line, 0 or more
     lower: Float[np.ndarray, "N"]
-    peduncle: float  # x of the narrowest place before the tail fin; 1 where no fin spreads
+    peduncle: float  # x of the narrowest place before the tail fin; 1 if no fin spreads
     edge_x: Float[np.ndarray, "M"]  # the tail fin's trailing edge at these heights
     edge_y: Float[np.ndarray, "M"]  # rising from the lower (negative) to the upper lobe
 
@@ -64,9 +64,9 @@ def fish_outline(
     """Measure a straight fish, lying in any direction, whose pixels are True in `mask`.
 
     Head and tail are distinguished by the tail fin's spread or, without one, by the larger half,
-    which is the head's; `head_is_left` says it instead. Raises TemplateError where the mask shows
-    no fish, more than one, one too small or too bent, or one whose ends are alike; `name` stands in
-    the message.
+    which is the head's; `head_is_left` overrides it. Raises TemplateError if the mask shows no
+    fish, several fish, a fish that is too small or too bent, or one with ends that are alike;
+    `name` stands in the message.
     """
     blob = _one_blob(mask, name=name)
     # The left and the right end of its principal axis.
@@ -92,7 +92,7 @@ def fish_outline(
     if head_is_left is None:
         head_is_left = _head_is_left(widths, name=name)
     head, tail = (left, right) if head_is_left else (right, left)
-    for _ in range(2):  # first from the farthest pixels, then from what was found with these
+    for _ in range(2):  # first from the farthest pixels, then from the ends found with these
         canvas, to_pixels = _straightened(blob, head, tail)
         head, tail = (to_pixels(point) for point in _snout_and_fork(canvas))
     canvas, _ = _straightened(blob, head, tail)
@@ -159,7 +159,7 @@ def _widths(canvas: Bool[np.ndarray, "R C"]) -> Float[np.ndarray, "N"]:
 
 
 def _head_is_left(widths: Float[np.ndarray, "N"], *, name: str) -> bool:
-    """Whether the tail fin spreads on the right; without one, whether the left half is larger.
+    """True if the tail fin spreads on the right; without one, if the left half is larger.
 
     Raises TemplateError for an outline that is the same from both ends, as an ellipse is.
     """
@@ -215,7 +215,7 @@ def _middle_row(columns: Bool[np.ndarray, "R C"]) -> float:
 def _measured(
     canvas: Bool[np.ndarray, "R C"], head: Float[np.ndarray, "2"], tail: Float[np.ndarray, "2"]
 ) -> FishOutline:
-    """The outline of a canvas whose row between snout and fork is the middle one."""
+    """The outline of a canvas whose middle row is the one between snout and fork."""
     middle = canvas.shape[0] // 2
     filled = np.flatnonzero(canvas.any(axis=0))
     columns = np.arange(max(filled[0], _MARGIN_PX), filled[-1] + 1)
@@ -261,8 +261,8 @@ def find_points(mesh: trimesh.Trimesh, *, name: str) -> dict[str, Float[np.ndarr
 
     The body lies along the longest principal axis of the surface. Its tail is the end with the
     thinner sections, and the direction in which these are broad is that of the side view, in which
-    snout and fork are found; the other points lie on the line between. Raises TemplateError where
-    the shape is not that of a straight fish.
+    snout and fork are found; the other points lie on the line between. Raises TemplateError if the
+    shape is not that of a straight fish.
     """
     axes = _fish_axes(mesh)
     fish = trimesh.Trimesh(mesh.vertices @ axes.T, mesh.faces, process=False)

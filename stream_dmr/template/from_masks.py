@@ -24,7 +24,7 @@ NUM_RINGS, NUM_SECTORS = 36, 16  # chosen: 578 vertices, about as many as a fit 
 
 
 def ring_places() -> Float[np.ndarray, "R"]:
-    """Where the rings stand, between 0 and 1: denser at both ends, where outlines turn."""
+    """Places of the rings between 0 and 1: denser at both ends, where outlines turn."""
     return (1 - np.cos(np.linspace(0, np.pi, NUM_RINGS + 2)[1:-1])) / 2
 
 
@@ -62,8 +62,8 @@ def _faces(num_rings: int, num_sectors: int) -> Int[np.ndarray, "F 3"]:
     return np.vstack([np.stack(corners, axis=1) for corners in ((a, c, b), (b, c, d), *fans)])
 
 
-_MIN_HALF_THICKNESS = 0.003  # of the fork length: that of the tail fin's edge in `body_forms.toml`
-_LOBE_TIP = 0.005  # chosen: parts of the trailing edge that lie so near to the farthest are its tip
+_MIN_HALF_THICKNESS = 0.003  # of the fork length: the tail fin's edge in `body_forms.toml`
+_LOBE_TIP = 0.005  # chosen: parts of the trailing edge so near to the farthest are its tip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,8 +85,8 @@ def template_from_masks(
     Without `top`, the thickness along the body is that of the bundled body form whose outline is
     nearest; `thickness` scales it to this largest thickness, as a share of the breadth.
 
-    Raises TemplateError where a mask can't be read or shows no whole straight fish, `thickness` is
-    out of range, or both `top` and `thickness` are given.
+    Raises TemplateError if a mask can't be read or shows no whole straight fish, if `thickness` is
+    out of range, or if both `top` and `thickness` are given.
     """
     if top is not None and thickness is not None:
         raise TemplateError(
@@ -136,7 +136,7 @@ def outline_mesh(outline: FishOutline, half_thickness: Float[np.ndarray, "N"]) -
 
     x runs from snout to tail, y from the lower to the upper edge, z through the thickness. Rings of
     the tail fin are bent backwards, the more the nearer they are to its trailing edge, so that the
-    last one runs along that edge from lobe to lobe.
+    last ring runs along that edge from lobe to lobe.
     """
     across, through = np.cos(ring_angles()), np.sin(ring_angles())
     trailing_edge = _trailing_edge(outline, across)

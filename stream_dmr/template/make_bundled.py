@@ -1,9 +1,9 @@
-"""Makes the bundled templates from `body_forms.toml`: `python -m stream_dmr.template.make_bundled`.
+"""Make the bundled templates from `body_forms.toml`: `python -m stream_dmr.template.make_bundled`.
 
 Each is a body of elliptic sections along a straight midline, whose half depth and half thickness
 follow a table of the species' proportions, in fork lengths: the length by which these species are
-measured. Fins that stand in the silhouette are part of the outline. A new body form is one more
-table in that file, with its source, and a run of this module.
+measured. Fins that stand in the silhouette are part of the outline. To add a body form, add a table
+to that file, with its source, and run this module.
 """
 
 from pathlib import Path

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     import manifold3d
 
 # Chosen. An open part with less of the surface than this (a tooth, an eyelid) does not matter for
-# an outline and is removed. One whose holes would need more than this share of its own area (a fin
-# modelled without thickness needs all of it) is a sheet, and gets this half thickness, in units of
-# the mesh's size: that of a tail fin's edge in `body_forms.toml`.
+# an outline and is removed. A part whose holes would need more than this share of its own area (a
+# fin modelled without thickness needs all of it) is a sheet, and gets this half thickness, in units
+# of the mesh's size: that of a tail fin's edge in `body_forms.toml`.
 _MIN_OPEN_AREA = 0.01
 _MAX_FILLED_AREA = 0.5
 _SHEET_HALF_THICKNESS = 0.003
@@ -31,7 +31,7 @@ _MIN_BODY_VOLUME = 0.05  # of the whole: a smaller part that touches nothing is 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RepairedMesh:
-    """A closed mesh, faces counter-clockwise seen from outside, and what was changed to get it."""
+    """A closed mesh, faces counter-clockwise seen from outside, and the changes made to get it."""
 
     mesh: trimesh.Trimesh
     changes: tuple[str, ...]  # empty: the mesh was closed already
@@ -40,7 +40,7 @@ class RepairedMesh:
 def repair_mesh(mesh: trimesh.Trimesh, *, name: str) -> RepairedMesh:
     """Return `mesh` itself if it is closed, otherwise one closed surface made of its parts.
 
-    Raises TemplateError where nothing of it can be closed, or separate bodies remain.
+    Raises TemplateError if nothing of it can be closed, or separate bodies remain.
     """
     if mesh.is_watertight and mesh.is_winding_consistent:
         if mesh.volume < 0:
@@ -86,8 +86,8 @@ def repair_mesh(mesh: trimesh.Trimesh, *, name: str) -> RepairedMesh:
 def _filled(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with every hole closed by a fan from the middle of its rim.
 
-    `trimesh.repair.fill_holes` draws its fan from a vertex of the rim, and meets edges that are
-    there already where the rim is not convex.
+    `trimesh.repair.fill_holes` draws its fan from a vertex of the rim, and meets edges that exist
+    already if the rim is not convex.
     """
     rim, size = _rim(mesh), len(mesh.vertices)
     links = coo_array((np.ones(len(rim)), rim.T), shape=(size, size))
@@ -142,7 +142,7 @@ def _united(parts: list[trimesh.Trimesh], *, name: str) -> tuple[trimesh.Trimesh
 
 
 def _solid(part: trimesh.Trimesh) -> "manifold3d.Manifold":
-    """The volume that a closed part encloses; empty where manifold3d refuses the part."""
+    """The volume that a closed part encloses; empty if manifold3d refuses the part."""
     import manifold3d
 
     a, b, c = part.triangles.swapaxes(0, 1)

@@ -37,7 +37,7 @@ class Template:
 def simplified(template: Template, *, max_faces: int) -> Template:
     """The same body with at most `max_faces` faces (Garland and Heckbert, SIGGRAPH 1997).
 
-    The template itself where it has no more, or where the simplified surface would be open.
+    The template itself if it has no more, or if the simplified surface would be open.
     """
     if len(template.faces) <= max_faces:
         return template
@@ -59,8 +59,8 @@ def canonical_template(
     """The template of a closed mesh in any unit, place and orientation.
 
     `points` holds `keypoints` (head, center, tail) and `joints` (J, 3; J >= 2, in any order) in the
-    mesh's coordinates. Raises TemplateError where a point lies off the mesh, or head and
-    tail, or joints, coincide.
+    mesh's coordinates. Raises TemplateError if a point lies off the mesh, or if head and tail, or
+    joints, coincide.
     """
     keypoints, joints = points["keypoints"], points["joints"]
     head, _, tail = keypoints
@@ -136,7 +136,7 @@ def _canonical_axes(
 
 
 # Every mesh that this project makes has these points on its straight midline, in fork lengths. The
-# paper's template has two joints and does not say where; near the thirds of the body is chosen.
+# paper's template has two joints in unstated places; near the thirds of the body is chosen.
 CENTER = 0.5
 JOINTS = (0.36, 0.68)
 

@@ -29,10 +29,10 @@ def load_template(
 
     A mesh that is not closed is repaired (see `repair_mesh`). The TOML beside it has the mesh's
     name and holds `joints` (two or more points, in any order) and `[keypoints] head, center, tail`,
-    in the mesh's own coordinates; it may say in `[length]` which length the tail keypoint ends,
-    `tail = "fork"` or `"total"`, and `total_per_fork`. Without a TOML, the points are found (see
-    `find_points`). `on_notice` is called with one line about what was repaired, and one about what
-    was found. Raises TemplateError where mesh or TOML can't be used.
+    in the mesh's own coordinates; its `[length]` may name the length that ends at the tail
+    keypoint, `tail = "fork"` or `"total"`, and `total_per_fork`. Without a TOML, the points are
+    found (see `find_points`). `on_notice` is called with one line about repairs, and one about the
+    points found. Raises TemplateError if mesh or TOML can't be used.
     """
     mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
     if not mesh_path.is_file():
@@ -69,7 +69,7 @@ def load_template(
 def save_template(template: Template, path: Path, *, comment: str) -> None:
     """Write a template's mesh, and its TOML beside it, as `load_template` reads them.
 
-    Raises OutputError where they can't be written.
+    Raises OutputError if they can't be written.
     """
     head, center, tail = template.keypoints.tolist()
     lines = [
@@ -129,7 +129,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def _length_of(table: dict[str, Any], path: Path) -> tuple[str | None, float | None]:
-    """What `[length]` says: the length that the tail ends, and total over fork length."""
+    """`[length]` of the TOML: the length that ends at the tail, and total over fork length."""
     length = table.get("length", {})
     if not isinstance(length, dict):
         raise TemplateError(f"template {path}: expected a table [length], got {length}")
