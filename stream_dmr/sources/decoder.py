@@ -21,12 +21,13 @@ from jaxtyping import UInt8
 
 from stream_dmr.sources.decoder_process import NUM_SLOTS
 
-_LENT_SLOTS = NUM_SLOTS - 3  # to pictures in use: one slot is written, one waits, one is read
+# To pictures in use, without three slots: one is written, another waits, the third is read.
+_LENT_SLOTS = NUM_SLOTS - 3
 _PROGRAM = Path(__file__).with_name("decoder_process.py")
 
 
 class DecodingError(Exception):
-    """The decoder gives no more pictures; the message says why."""
+    """The decoder returns no more pictures; the message has the reason."""
 
 
 class ResizedError(DecodingError):
@@ -41,27 +42,27 @@ class ResizedError(DecodingError):
 class DecodedPicture:
     """One decoded picture."""
 
-    milliseconds: float  # timestamp of the container or stream, as OpenCV gives it
+    milliseconds: float  # timestamp of the container or stream, from OpenCV
     image: UInt8[np.ndarray, "H W 3"]  # BGR
 
 
 class Decoder:
     """Pictures of one video, stream or camera, in order, from a child process.
 
-    Pictures come through shared memory, what is said about them as lines of JSON through a pipe;
-    see `decoder_process`.
+    Pictures come through shared memory, messages about them as lines of JSON through a pipe; see
+    `decoder_process`.
     """
 
     def __init__(self, address: str) -> None:
         """Start decoding a path, an address or a camera's index; errors come with `read`."""
         self.width = self.height = 0  # px, known after the first picture, as are these:
-        self.fps = 0.0  # as the container says; 0, NaN or impossible where it doesn't
+        self.fps = 0.0  # of the container; 0, NaN or impossible if it has none
         self.promised = 0.0  # number of frames, likewise
         self.num_errors = 0  # pictures, and the end, before which FFmpeg reported errors
         self._reading = Lock()
         self._shared: memoryview | None = None  # all slots
         self._num_lent = 0  # slots that pictures in use lie in
-        self._unused = SimpleQueue[int]()  # slots whose picture is no longer used, not yet told
+        self._unused = SimpleQueue[int]()  # slots of pictures no longer used, not yet sent back
         self._received = b""  # of the pipe, not yet a whole line
         self._memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
         self._process = subprocess.Popen(
@@ -77,8 +78,8 @@ class Decoder:
     def read(self, *, timeout_s: float) -> DecodedPicture | None:
         """Wait for the next picture; None at the end.
 
-        Raises DecodingError where none comes for `timeout_s` or the process has died, and
-        ResizedError where the next picture has another size.
+        Raises DecodingError if none comes for `timeout_s` or the process has died, and
+        ResizedError if the next picture has another size.
         """
         with self._reading:
             return self._read(timeout_s)
@@ -122,7 +123,7 @@ class Decoder:
     def _picture(self, slot: int) -> UInt8[np.ndarray, "H W 3"]:
         """The picture of a slot, which is unused when nothing refers to it, or to its parts.
 
-        Where many pictures are in use, it is a copy, since the child must not wait for them.
+        It is a copy if many pictures are in use, since the child must not wait for them.
         """
         assert self._shared is not None
         size = self.height * self.width * 3
@@ -145,7 +146,7 @@ class Decoder:
                 self._process.stdin.write(bytes([self._unused.get()]))
 
     def _receive(self, deadline_s: float) -> dict[str, Any] | None:
-        """The child's next message; None where it has ended. Raises DecodingError if too late."""
+        """The child's next message; None if it has ended. Raises DecodingError if too late."""
         assert self._process.stdout is not None
         while b"\n" not in self._received:
             if self._process.stdout.closed:
@@ -166,9 +167,9 @@ _ahead: dict[str, Decoder] = {}  # by address: not yet asked for
 
 @contextmanager
 def decoding_ahead(path: Path) -> Generator[None]:
-    """Begin to decode a video file; the next `open_decoder` of it inside takes that over.
+    """Begin to decode a video file; the next `open_decoder` of it inside takes over that process.
 
-    A process and its first picture take half a second, in which this one can import the rest.
+    A process and its first picture take half a second, in which this process imports the rest.
     """
     address = _address_of(path)
     _ahead[address] = Decoder(address)
@@ -186,5 +187,5 @@ def open_decoder(path: Path) -> Decoder:
 
 
 def _address_of(path: Path) -> str:
-    """Absolute: FFmpeg takes what stands before a colon in a relative path for a protocol."""
+    """The absolute path: FFmpeg takes text before a colon in a relative path for a protocol."""
     return str(path.resolve())

@@ -1,13 +1,13 @@
-"""The decoding program, a process of its own, since a damaged bitstream can crash the decoder.
+"""The decoding program, a separate process, since a damaged bitstream can crash the decoder.
 
     python -P decoder_process.py ADDRESS MEMORY_FD
 
 Each picture goes into a slot of the shared memory, and a line of JSON about it to stdout; the
 slot's number comes back as one byte on stdin when the picture is no longer used. The process ends
-with stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
+with stdin. It imports nothing of stream_dmr, so that it starts quickly.
 
-FFmpeg makes up what is damaged, and OpenCV has no sign of it; but FFmpeg prints that. So it prints
-into a file in memory here, and a line of JSON says whether errors came.
+FFmpeg conceals damage, and OpenCV does not report it; but FFmpeg prints it. So FFmpeg prints into a
+file in memory, and a line of JSON reports whether errors came.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "32"  # AV_LOG_INFO
 import cv2
 import numpy as np
 
-# A line of the levels "panic", "fatal" or "error"; and what H.264 says as information only.
+# A line of the levels "panic", "fatal" or "error", or H.264's note of concealment, an information.
 _ERRORS = re.compile(rb"FFMPEG:(00|08|16)\]|\bconcealing\b")
 
 NUM_SLOTS = 8  # most of them hold pictures in use
@@ -45,7 +45,7 @@ def main(address: str, memory: int) -> None:
     place = (int(address),) if address.isdecimal() else (address, cv2.CAP_FFMPEG)
     lines, printed = os.dup(1), _Printed()
     capture = cv2.VideoCapture(*place)
-    printed.has_errors()  # it looks at some pictures here, and at the same ones again
+    printed.has_errors()  # opening reads some pictures, which are read again
     is_read, image = capture.read()
     if not is_read or image.ndim != 3 or image.dtype != np.uint8:
         return
@@ -75,7 +75,7 @@ def main(address: str, memory: int) -> None:
 
 
 class _Printed:
-    """What C code prints, kept from stdout."""
+    """Output of C code, kept from stdout."""
 
     def __init__(self) -> None:
         self._file = os.memfd_create("printed")
@@ -83,7 +83,7 @@ class _Printed:
         self._flush = ctypes.CDLL(None).fflush
 
     def has_errors(self) -> bool:
-        """Whether errors were printed since the last call."""
+        """True if errors were printed since the last call."""
         self._flush(None)
         num_bytes = os.fstat(self._file).st_size
         if not num_bytes:

@@ -27,15 +27,15 @@ from stream_dmr.sources.video_file import VideoFile
 
 OtherSizes = Literal["refuse", "leave_out", "take"]
 _DEPTHS = {"uint8", "uint16"}
-# What telephones and cameras write and OpenCV does not read.
+# Formats of telephones and cameras that OpenCV does not read.
 _UNREADABLE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"}
 
 
 class PictureFolder(Source):
     """A folder of pictures in natural order (`2.png` before `10.png`), usually of one size.
 
-    Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded, or is cut off, is left out
-    with a warning but keeps its frame index, so that boxes and masks stay with their pictures.
+    Grey and 16-bit pictures become 8-bit BGR. A picture that can't be decoded, or is cut off, is
+    left out with a warning but keeps its frame index: boxes and masks stay with their pictures.
     """
 
     def __init__(
@@ -46,11 +46,10 @@ class PictureFolder(Source):
         other_sizes: OtherSizes = "refuse",
         as_sensor: bool = False,
     ) -> None:
-        """`other_sizes`: what becomes of pictures whose size is not the first one's.
+        """`other_sizes`: how to treat pictures of another size than the first one's.
 
-        Those that are left out are not of the size that most have. `as_sensor`: pictures are not
-        turned upright, see `[read_frames] orientation`. Raises SourceError where no picture can be
-        decoded.
+        "leave_out" keeps the size that most pictures have. `as_sensor`: pictures are not turned
+        upright, see `[read_frames] orientation`. Raises SourceError if no picture can be decoded.
         """
         self._paths, unreadable = _pictures_in(folder)
         self._is_closed = False
@@ -66,11 +65,11 @@ class PictureFolder(Source):
                 f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
             )
         self.height, self.width = first.shape[:2]
-        if other_sizes == "leave_out":  # one picture of another telephone may be the first
+        if other_sizes == "leave_out":  # the first picture may be of another telephone
             sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
             self.height, self.width = max(sizes, key=lambda size: sizes[size])
-        # Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
-        # but black. A folder is taken for 12 bits where a sample stays below 4096.
+        # Sensors of 12 bits often write their values unscaled into 16 bits, which look all but
+        # black. A folder is taken for 12 bits if a sample of it stays below 4096.
         self._white = 2**16 - 1
         if first.dtype == np.uint16 and all(p.max() < 2**12 for p in self._sample()):
             self._white = 2**12 - 1
@@ -115,9 +114,9 @@ class PictureFolder(Source):
             )
 
     def _read(self, path: Path) -> np.ndarray | None:
-        """As BGR of its own depth; None if it can't be read, or not to its end.
+        """The picture as BGR of its own depth; None if it can't be read, or not to its end.
 
-        Raises SourceError for one that is too large, before it takes the memory.
+        Raises SourceError for a picture that is too large, before it takes the memory.
         """
         if huge := size_if_huge(path):
             raise SourceError(
@@ -134,7 +133,7 @@ class PictureFolder(Source):
         return picture if picture is not None and picture.dtype.name in _DEPTHS else None
 
     def _sample(self) -> Iterator[np.ndarray]:
-        """About five pictures, evenly spaced; those that can be read."""
+        """About five pictures, evenly spaced, without unreadable pictures."""
         sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
         return (picture for picture in sample if picture is not None)
 
@@ -144,7 +143,7 @@ class PictureFolder(Source):
 
 
 def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
-    """Those that can be read, in natural order, and the names of others. SourceError for none."""
+    """Readable pictures in natural order, and names of others. SourceError if there are none."""
     try:
         pictures = pictures_in(folder)
         files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
@@ -182,14 +181,14 @@ class ClipFolder(Source):
     """The clips of a folder in natural order of their names, all of one size.
 
     Frames are numbered through all clips. A clip is read once it has stopped growing or a later
-    one is there; what comes into it after that, such as after a pause of its recorder, is read as
-    well. One that can't be read, or has another size, is left out with a warning. Capture
-    times: a clip ends when its file was last modified, but never begins before its predecessor
-    ended.
+    clip is there; frames that it receives after that, such as after a pause of its recorder, are
+    read as well. A clip that can't be read, or has another size, is left out with a warning.
+    Capture times: a clip ends when its file was last modified, but never begins before its
+    predecessor ended.
     """
 
     def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
-        """Raises SourceError where no clip can be read."""
+        """Raises SourceError if no clip can be read."""
         self.name = folder.resolve().name
         self.warnings: list[str] = []
         self._folder = folder
@@ -245,7 +244,7 @@ class ClipFolder(Source):
             done = self._frames_done.get(path.name, 0)
             for frame in self._video:
                 frame_index += 1
-                if frame.frame_index == done + 1:  # what was read before may lie before the last
+                if frame.frame_index == done + 1:  # frames read before may lie before the last time
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
                 last_ns = max(last_ns, start_ns + frame.timestamp_ns)
                 if frame.frame_index > done:
@@ -253,7 +252,7 @@ class ClipFolder(Source):
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             for line in self._video.warnings:
                 self._on_notice(line)
-            self.is_cut_off = self._video.is_cut_off  # of the last one: only that ends the frames
+            self.is_cut_off = self._video.is_cut_off  # of the last clip, which ends the frames
 
     def close(self) -> None:
         """Release the clip; the iteration ends."""
@@ -296,7 +295,7 @@ class ClipFolder(Source):
         """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
         seen: dict[str, _FileState] = {}
         unchanged_since = waiting_since = time.monotonic()
-        # A recorder brings a clip when its time is over, so the next one takes as long as the last.
+        # A recorder writes a clip when its time is over, so the next takes as long as the last.
         pause_s, is_pausing = max(_SETTLE_S, _PAUSE_CLIPS * self._clip_s), False
         while not self._closing.is_set():
             paths = [path for path in clips_in(self._folder) if self._has_more(path)]
@@ -323,7 +322,7 @@ class ClipFolder(Source):
 
 
 def clips_in(folder: Path) -> list[Path]:
-    """The videos of a folder, in natural order. Raises SourceError where it can't be read."""
+    """The videos of a folder, in natural order. Raises SourceError if it can't be read."""
     try:
         files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
         files = [path for path in files if path.is_file() and not path.name.startswith(".")]
@@ -335,7 +334,7 @@ def clips_in(folder: Path) -> list[Path]:
 
 
 def _state_of(path: Path) -> _FileState | None:
-    """Size and time of the last write; None where the file was removed meanwhile."""
+    """Size and time of the last write; None if the file was removed meanwhile."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -49,7 +49,7 @@ class CaptureClock:
         self._capture_from_stream = None
 
     def wall_step_ns(self, *, wall_ns: int, monotonic_ns: int) -> int:
-        """By how much the wall clock was stepped since the last call (or the start), ns."""
+        """Return by how much the wall clock was stepped since the last call (or the start), ns."""
         step_ns = wall_ns - monotonic_ns - self._wall_from_monotonic
         self._wall_from_monotonic += step_ns
         return step_ns
@@ -88,7 +88,7 @@ class LiveStream(Source):
     """
 
     def __init__(self, address: str, settings: ReadFramesSettings) -> None:
-        """Raises SourceError where no picture comes for `connect_s`."""
+        """Raises SourceError if no picture comes for `connect_s`."""
         is_camera = address.isdecimal()
         # Names are recorded, so user and password are cut out of addresses.
         self.name = f"camera {address}" if is_camera else re.sub(r"(?<=://)[^/]*@", "", address)
@@ -137,7 +137,7 @@ class LiveStream(Source):
         self._after_ns = point.after_ns
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames from now on; those of a camera that arrived before are discarded uncounted."""
+        """The frames from now on; earlier frames of a camera are discarded uncounted."""
         if self.is_endless:
             with self._changed:
                 self._queue.clear()
@@ -180,7 +180,7 @@ class LiveStream(Source):
         self._decoder.close()
 
     def _dequeue(self) -> _Arrival | None:
-        """Wait for the next picture; None at the end. Raises what ended the receiving thread."""
+        """Wait for the next picture; None at the end. Raises the receiving thread's error."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._has_ended)
             if not self._queue:
@@ -192,7 +192,7 @@ class LiveStream(Source):
             return self._queue.popleft()
 
     def _receive(self, first: DecodedPicture) -> None:
-        """The receiving thread: pictures into the queue, reconnecting where necessary."""
+        """The receiving thread: put pictures into the queue, and reconnect if necessary."""
         try:
             self._enqueue(first)
             self._receive_until_closed()
@@ -239,10 +239,10 @@ class LiveStream(Source):
             self._changed.notify_all()
 
     def _reconnect(self, reason: str) -> None:
-        """Try until the camera gives a picture of the first one's size, or `close`.
+        """Try until the camera delivers a picture of the first one's size, or until `close`.
 
         The pauses double, and each is shortened at random by up to a half, so that several boxes
-        do not ask one camera in step.
+        do not ask the same camera in step.
         """
         if self._closing.is_set():
             return

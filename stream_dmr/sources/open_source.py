@@ -15,7 +15,7 @@ from stream_dmr.sources.video_file import VideoFile
 def open_source(source: str, settings: ReadFramesSettings) -> Source:
     """A source by its path, address (`rtsp://...`) or camera index, with its first frame read.
 
-    Raises SourceError where nothing can be read from it.
+    Raises SourceError if nothing can be read from it.
     """
     if not source.strip():
         raise SourceError(
@@ -46,8 +46,8 @@ def open_positions(
 ) -> PositionSource:
     """The positions for the frames of a source.
 
-    `is_since_1970`: those have times of day, as those of a camera, and not from the start of a
-    video. Raises SourceError where nothing can be read from it.
+    `is_since_1970`: the frames have times of day, as from a camera, and not from the start of a
+    video. Raises SourceError if nothing can be read from it.
     """
     if Path(address).is_file():
         return PositionFile(Path(address), settings, is_since_1970=is_since_1970)

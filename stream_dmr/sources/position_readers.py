@@ -34,16 +34,16 @@ _MAX_LINE_BYTES = 4096  # chosen: a sentence has 82, a row of any table hardly m
 
 
 class PositionFile(PositionSource):
-    """Read as frames pass, so that it may be longer than memory is large.
+    """Positions of a file, read as frames pass, so that it may be longer than memory is large.
 
     A `.csv` has the columns time_utc (ISO 8601), latitude, longitude and perhaps speed_knots and
-    course_deg; any other file is read as lines of NMEA 0183, whose RMC or GGA say the time.
+    course_deg; any other file is read as lines of NMEA 0183, whose RMC or GGA have the time.
     """
 
     def __init__(self, path: Path, settings: SensorsSettings, *, is_since_1970: bool) -> None:
-        """`is_since_1970`: the frames have times of day, a video's begin with 0.
+        """`is_since_1970`: the frames have times of day; those of a video begin with 0.
 
-        Raises SourceError where there is no position in it, or a video's start is not known.
+        Raises SourceError if the file has no position, or if a video's start is not known.
         """
         zero_ns = settings.offset_ns if is_since_1970 else settings.zero_utc_ns
         if zero_ns is None:
@@ -74,7 +74,7 @@ class PositionFile(PositionSource):
         return self._builder.counts
 
     def take(self, frame: Frame) -> Sequence[Position]:
-        """The positions up to a frame; of those before the first one only the last."""
+        """The positions up to a frame; before the first frame only the last position."""
         found: list[Position] = []
         self._last_frame = frame.frame_index
         while self._next is not None and self._next[0] <= frame.timestamp_ns:
@@ -88,7 +88,7 @@ class PositionFile(PositionSource):
         return found
 
     def finish(self) -> Sequence[Position]:
-        """The next position, if any: what lies before it is interpolated."""
+        """The next position, if any, for interpolation before it."""
         return [] if self._next is None else [self._message(self._next)]
 
     def close(self) -> None:
@@ -100,7 +100,7 @@ class PositionFile(PositionSource):
     def _in_order(self) -> Iterator[tuple[int, Fix]]:
         """Time on the clock of the frames, increasing, and fix; others are counted as jumps."""
         last_ns: int | None = None
-        waiting: tuple[int, Fix] | None = None  # a wrong first date is known by what follows it
+        waiting: tuple[int, Fix] | None = None  # a wrong first date shows in the next position
         is_csv = self._path.suffix.lower() == ".csv"
         sentences = map(self._builder.take, self._lines())
         for fix in self._csv_fixes() if is_csv else filter(None, sentences):
@@ -118,7 +118,7 @@ class PositionFile(PositionSource):
             yield waiting
 
     def _lines(self) -> Iterator[bytes]:
-        """Raises SourceError at one that does not end."""
+        """The lines of the file. Raises SourceError at a line that does not end."""
         while line := self._file.readline(_MAX_LINE_BYTES + 1):
             if len(line) > _MAX_LINE_BYTES:
                 self.close()
@@ -163,7 +163,7 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def _csv_fix(row: dict[str, str]) -> Fix | None:
-    """The position of a row; None where a cell is no time or no place on the earth."""
+    """The position of a row; None if a cell is no time or no place on the earth."""
     try:
         optional = {name: float(row[name]) for name in _OPTIONAL_COLUMNS if row.get(name)}
         latitude, longitude = float(row["latitude"]), float(row["longitude"])
@@ -187,7 +187,7 @@ class ByteStream(Protocol):
     """An open connection."""
 
     def read(self) -> bytes:
-        """What has come; b"" where nothing came for half a second. OSError where it is lost."""
+        """Received bytes; b"" if nothing came for half a second. OSError if the link is lost."""
         ...
 
     def close(self) -> None:
@@ -196,10 +196,10 @@ class ByteStream(Protocol):
 
 
 class ReceiverAddress:
-    """Where a receiver is: `tcp://HOST:PORT`, `udp://HOST:PORT` or a serial device."""
+    """Address of a receiver: `tcp://HOST:PORT`, `udp://HOST:PORT` or a serial device."""
 
     def __init__(self, text: str, *, baud: int) -> None:
-        """Raises SourceError where it is none of these. Nothing is opened yet."""
+        """Raises SourceError for another kind of address. Nothing is opened yet."""
         self.text, self._baud = text, baud
         match = _ADDRESS.fullmatch(text)
         is_address = match is not None and 0 < int(match[3]) < 65536
@@ -211,7 +211,7 @@ class ReceiverAddress:
             )
 
     def open(self) -> ByteStream:
-        """Connect. Raises OSError where that is not possible now."""
+        """Connect. Raises OSError if that is not possible now."""
         if self._place is None:
             return _SerialStream(self.text, self._baud)
         protocol, host, port = self._place
@@ -290,14 +290,14 @@ _JITTER = random.Random()  # its own: a user of the library may have seeded `ran
 
 
 class PositionReceiver(PositionSource):
-    """Receives in a thread of its own, and connects again for as long as the run goes on.
+    """Receives in a thread of its own, and reconnects as long as the run lasts.
 
-    A receiver that is away when a run begins is a problem that the run tells, and no reason not to
-    measure. A position's `timestamp_ns` is when its sentence came, its `utc_ns` what it says.
+    A receiver that is away when a run begins is reported as a problem; the run measures without it.
+    A position's `timestamp_ns` is when its sentence came, its `utc_ns` the sentence's own time.
     """
 
     def __init__(self, address: str, settings: SensorsSettings) -> None:
-        """Raises SourceError where the address is none."""
+        """Raises SourceError for an invalid address."""
         self.name = address
         self._address = ReceiverAddress(address, baud=settings.baud)
         self._silence_s = settings.silence_s

@@ -22,12 +22,12 @@ _MAX_BYTES = 120  # of a sentence; the standard has 82
 
 
 class WrongChecksumError(UserError):
-    """A sentence whose checksum is not that of its text."""
+    """A sentence whose checksum does not match its text."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PositionSentence:
-    """One RMC or GGA; None where it leaves something empty."""
+    """An RMC or GGA sentence; None for its empty fields."""
 
     kind: str  # "RMC" or "GGA"
     day: date | None  # UTC; a GGA has none
@@ -36,13 +36,13 @@ class PositionSentence:
     longitude: float | None  # east positive
     speed_knots: float | None = None  # over ground
     course_deg: float | None = None  # over ground, clockwise from true north
-    is_fix: bool  # does the receiver say that it measured this position?
+    is_fix: bool  # the receiver claims to have measured this position
 
 
 def read_sentence(line: bytes) -> PositionSentence | None:
     """The position in a line; None for sentences of other kinds.
 
-    Raises WrongChecksumError, and ValueError where it is no sentence.
+    Raises WrongChecksumError, and ValueError if it is no sentence.
     """
     text = line.strip()
     if len(text) > _MAX_BYTES:
@@ -93,7 +93,7 @@ def _degrees(value: object, limit: float) -> float | None:
 
 
 def _number(value: object) -> float | None:
-    """A field as a number; an empty one is a text for pynmeagps."""
+    """A field as a number; pynmeagps returns an empty field as text."""
     return float(value) if isinstance(value, int | float) else None
 
 
@@ -108,7 +108,7 @@ _M_PER_S = 1852 / 3600  # a knot
 
 @dataclass(kw_only=True)
 class PositionCounts:
-    """What came from a receiver or a file of its sentences, and what was left out of it."""
+    """Counts of the sentences of a receiver or a file, and of those left out."""
 
     sentences: int = 0  # lines, of any kind
     positions: int = 0  # that are used
@@ -123,7 +123,7 @@ class PositionCounts:
     last_position_ns: int = 0  # likewise, of a position
 
     def left_out(self) -> str:
-        """What was left out, in words; "" where nothing was."""
+        """The counts of sentences left out, in words; "" if there are none."""
         words = {
             "wrong_checksum": "with a wrong checksum",
             "unreadable": "unreadable",
@@ -145,7 +145,7 @@ COUNTED = [field.name for field in fields(PositionCounts) if not field.name.ends
 class Fix:
     """One position as a receiver gave it; degrees, WGS 84."""
 
-    utc_ns: int | None  # its own time, ns since 1970; None: it gives no date
+    utc_ns: int | None  # its own time, ns since 1970; None without a date
     latitude: float
     longitude: float
     speed_knots: float | None = None
@@ -158,7 +158,7 @@ class FixBuilder:
     def __init__(
         self, settings: SensorsSettings, *, now_ns: Callable[[], int | None] = lambda: None
     ) -> None:
-        """`now_ns` gives about the UTC of the next sentence by another clock; None: unknown."""
+        """`now_ns` returns the approximate UTC of the next sentence by another clock, or None."""
         self.counts = PositionCounts()
         self._now_ns = now_ns
         self._gate = JumpGate(settings.max_speed_knots)
@@ -166,9 +166,9 @@ class FixBuilder:
         self._last_rmc_ns: int | None = None  # its time of day
 
     def take(self, line: bytes, *, arrival_ns: int | None = None) -> Fix | None:
-        """The position in a line; None where it has none, or none that can be believed.
+        """The position in a line; None if it has none, or none that is plausible.
 
-        `arrival_ns`: on a clock that goes evenly; None: the receiver's own time is such a clock,
+        `arrival_ns`: on a clock that runs evenly; None: the receiver's own time is such a clock,
         and positions without it are of no use.
         """
         if not line.strip():
@@ -202,7 +202,7 @@ class FixBuilder:
         return fix
 
     def _is_repeated(self, sentence: PositionSentence) -> bool:
-        """True for a GGA of a receiver that sends RMC as well, which says more."""
+        """True for a GGA of a receiver that sends RMC as well, which contains more."""
         now_ns = sentence.time_of_day_ns
         if sentence.kind == "RMC":
             self._last_rmc_ns = now_ns
@@ -234,7 +234,7 @@ class FixBuilder:
         return near_ns + _centred(sentence.time_of_day_ns - near_ns, _DAY_NS)
 
     def _without_roll_over(self, utc_ns: int) -> int:
-        """The date put right where it is off by 1024 weeks, to within a day of the other clock."""
+        """Correct a date that is off by 1024 weeks, to within a day of the other clock."""
         now_ns = self._now_ns()
         if now_ns is None or abs(utc_ns - now_ns) < _ROLL_OVER_NS // 2:
             return utc_ns
@@ -275,10 +275,10 @@ class JumpGate:
         return seconds >= 0 and distance_m(before[0], now[0]) <= reach_m
 
 
-def distance_m(one: Fix, other: Fix) -> float:
+def distance_m(first: Fix, second: Fix) -> float:
     """Great-circle distance on a sphere, m (haversine)."""
-    lat0, lat1 = math.radians(one.latitude), math.radians(other.latitude)
-    half_lat, half_lon = (lat1 - lat0) / 2, math.radians(other.longitude - one.longitude) / 2
+    lat0, lat1 = math.radians(first.latitude), math.radians(second.latitude)
+    half_lat, half_lon = (lat1 - lat0) / 2, math.radians(second.longitude - first.longitude) / 2
     share = math.sin(half_lat) ** 2 + math.cos(lat0) * math.cos(lat1) * math.sin(half_lon) ** 2
     return 2 * _EARTH_M * math.asin(min(1.0, math.sqrt(share)))
 
@@ -299,7 +299,7 @@ class PositionSource(ABC):
     @property
     @abstractmethod
     def counts(self) -> PositionCounts:
-        """What came so far, and what was left out of it."""
+        """Counts so far, also of positions left out."""
 
     @abstractmethod
     def take(self, frame: Frame) -> Sequence[Position]:
@@ -307,7 +307,7 @@ class PositionSource(ABC):
 
     @abstractmethod
     def finish(self) -> Sequence[Position]:
-        """Those after the last frame that fish before it need."""
+        """Positions after the last frame that the fish before it need."""
 
     def begin(self, *, after_ns: int) -> None:  # noqa: B027, optional
         """The first frame is about to come; `after_ns`: the last capture time of earlier runs."""
@@ -316,7 +316,7 @@ class PositionSource(ABC):
         """Call `on_notice`, in any thread, with a line for each loss and return of a receiver."""
 
     def problems(self) -> list[str]:
-        """Why there are no positions at present, for people; empty where there are."""
+        """Reasons for having no positions at present, for people; empty if there are positions."""
         return []
 
     def close(self) -> None:  # noqa: B027, optional

@@ -56,7 +56,7 @@ class SensorsSettings(Settings):
 
 
 def utc_ns_of(text: str) -> int:
-    """A time in ISO 8601 as ns since 1970; without a zone it is UTC. ValueError where it is none.
+    """A time in ISO 8601 as ns since 1970, in UTC if it has no zone. ValueError if it is no time.
 
     Digits after the microsecond are left out.
     """

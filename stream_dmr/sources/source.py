@@ -20,7 +20,7 @@ class CameraCounts:
 
     received: int = 0
     passed_on: int = 0
-    dropped: int = 0  # newer ones came before the chain had time for them
+    dropped: int = 0  # newer frames came before the chain had time for them
     failed: int = 0  # of another size than the camera's first
     reconnects: int = 0
     last_arrival_ns: int = 0  # monotonic clock
@@ -43,16 +43,16 @@ class ResumePoint:
 class Source(ABC):
     """Frames in order, to be iterated once; `frame_index` from 1, `timestamp_ns` increasing.
 
-    The properties say what a source can do, so that no user has to ask for its class. The defaults
-    are those of a file: it ends, can be read again, and begins again in every run.
+    The properties describe what a source can do, so that no user has to ask for its class. The
+    defaults are those of a file: it ends, can be read again, and begins again in every run.
     """
 
     name: str  # file name or address, for people
     width: int  # px, of every frame
     height: int
-    num_frames: int | None  # as the source promises; None where it doesn't
+    num_frames: int | None  # promised by the source; None if unknown
     fps: float
-    is_cut_off: bool = False  # True once it ended before what it promises, or by damage
+    is_cut_off: bool = False  # True if it ended too early, or by damage
     warnings: list[str]  # problems that did not end the reading, one line each; complete at the end
 
     @property
@@ -67,7 +67,7 @@ class Source(ABC):
 
     @property
     def has_clips(self) -> bool:
-        """True where `Frame.source` names one of several clips, each read once over all runs."""
+        """True if `Frame.source` names one of several clips, each read once over all runs."""
         return False
 
     @property
@@ -78,7 +78,7 @@ class Source(ABC):
     def listen(self, on_notice: Callable[[str], None]) -> None:
         """Call `on_notice`, in any thread, with a line for each loss and return of a camera.
 
-        What is wrong with a clip comes here at once, and is not in `warnings`.
+        Problems of a clip are reported here at once, and are not in `warnings`.
         """
         self._on_notice = on_notice
 
@@ -90,7 +90,7 @@ class Source(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
-        """Raises SourceError where a frame doesn't fit those before it."""
+        """Raises SourceError if a frame doesn't fit the frames before it."""
 
     @abstractmethod
     def close(self) -> None:
@@ -98,7 +98,7 @@ class Source(ABC):
 
 
 def nominal_ns(frame_index: int, fps: float) -> int:
-    """The time of a frame where only a constant rate is known, ns since the first frame."""
+    """The time of a frame at a constant rate, if no other is known; ns since the first frame."""
     return round((frame_index - 1) * _SECOND_NS / fps)
 
 

@@ -20,16 +20,16 @@ from stream_dmr.sources.source import ReadFramesSettings, Source, nominal_ns, si
 _MAX_MS = 1e12  # 31 years
 _MIN_FPS, _MAX_FPS = 1e-3, 1e6
 _MAX_FRAMES = 1e12
-_NEAR_END = 3  # frames; at a variable rate the last one may stand for longer
+_NEAR_END = 3  # frames; at a variable rate the last frame may stand for longer
 _MATROSKA = b"\x1a\x45\xdf\xa3"  # and WebM
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 
 
 class VideoFile(Source):
-    """A video file; a damaged one gives what FFmpeg makes of it, and a warning."""
+    """A video file. A damaged file is read as far as FFmpeg conceals the damage, with a warning."""
 
     def __init__(self, path: Path, settings: ReadFramesSettings) -> None:
-        """Raises SourceError where not even a first frame can be read."""
+        """Raises SourceError if not even a first frame can be read."""
         self.name = path.name
         self.warnings: list[str] = []
         self._on_notice: Callable[[str], None] = self.warnings.append
@@ -55,7 +55,7 @@ class VideoFile(Source):
         frame_index, timestamp_ns = 0, -1
         pending, self._first = self._first, None
         while pending is not None:
-            self._note_errors()  # of the frame before: at the last one of a cut file it is the cut
+            self._note_errors()  # of the frame before: at a cut file's last frame it is the cut
             frame_index += 1
             if self._decoder.num_errors and not self._first_error:
                 self._first_error = frame_index
@@ -84,7 +84,7 @@ class VideoFile(Source):
         self._decoder.close()
 
     def _note_errors(self) -> None:
-        """Say once that FFmpeg makes up what it could not decode."""
+        """Warn once that FFmpeg conceals parts that it could not decode."""
         if self._first_error and not self._is_noted:
             self._is_noted = True
             self._on_notice(
@@ -93,7 +93,7 @@ class VideoFile(Source):
             )
 
     def _read(self, *, after: int) -> DecodedPicture | None:
-        """The next picture; None at the end, and with a warning where the decoder fails."""
+        """The next picture; None at the end, also with a warning if the decoder fails."""
         try:
             return None if self._is_closed else self._decoder.read(timeout_s=self._timeout_s)
         except ResizedError as error:
@@ -111,7 +111,7 @@ class VideoFile(Source):
             return None
 
     def _warn_if_cut_off(self, num_read: int, *, last_ns: int) -> None:
-        """Containers without a frame count promise duration x rate, which may be one too many.
+        """Containers without a frame count promise duration x rate, which may be 1 too many.
 
         Matroska has no count; at a variable rate any number of frames may be all of a duration.
         """
@@ -130,11 +130,11 @@ class VideoFile(Source):
 def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_ns: int) -> int:
     """A container's timestamp as ns since the start of the stream, above `previous_ns`.
 
-    OpenCV gives float milliseconds; rounded to whole ns they are exact, since a double is off by
-    some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) Where the container
-    has no timestamp (OpenCV then gives 0) or an impossible one, the nominal time at `fps` is
-    used. One that repeats or steps back becomes 1 ns after the previous one, so that the correct
-    ones after it stay as they are.
+    OpenCV returns milliseconds as floats; rounded to whole ns they are exact, since a double is off
+    by some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) If the container
+    has no timestamp (OpenCV then returns 0) or an impossible one, the nominal time at `fps` is
+    used. A time that repeats or steps back becomes 1 ns after the previous time, so that the
+    correct times after it stay as they are.
     """
     if milliseconds == 0 or not abs(milliseconds) < _MAX_MS:
         timestamp_ns = nominal_ns(frame_index, fps)
@@ -144,17 +144,17 @@ def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_
 
 
 def plausible_fps(fps: float, settings: ReadFramesSettings) -> float:
-    """The container's frame rate; `images_fps` where it is missing or impossible."""
+    """The container's frame rate; `images_fps` if it is missing or impossible."""
     return fps if _MIN_FPS <= fps <= _MAX_FPS else settings.images_fps
 
 
 def promised_frames(promised: float) -> int | None:
-    """The container's number of frames; None where it is missing or impossible."""
+    """The container's number of frames; None if it is missing or impossible."""
     return int(promised) if 1 <= promised < _MAX_FRAMES else None
 
 
 def _first_bytes(path: Path) -> bytes:
-    """The bytes that identify a file's format. Raises SourceError where they can't be a video's."""
+    """The bytes that identify a file's format. Raises SourceError if they can't be a video's."""
     try:
         with open_file(path) as file:
             start = file.read(512)
@@ -170,7 +170,7 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _unreadable_reason(path: Path, start: bytes) -> str:
-    """Why a file gives no picture, judged by its first bytes and its MP4 index."""
+    """The reason why a file has no picture, by its first bytes and its MP4 index."""
     if start[8:12] == b"WAVE" or start[:3] == b"ID3" or start[:4] in (b"fLaC", b"OggS"):
         return "expected a video, got an audio file with no pictures in it"
     if start[4:8] == b"ftyp" and not _has_index(path):
@@ -182,7 +182,7 @@ def _unreadable_reason(path: Path, start: bytes) -> str:
 
 
 def _has_index(path: Path) -> bool:
-    """Whether an MP4 has its `moov` box.
+    """True if an MP4 has its `moov` box.
 
     Walks the top-level boxes: size (4 bytes, big-endian), name (4); ISO/IEC 14496-12, 4.2.
     """
@@ -218,14 +218,14 @@ class SeekableVideo:
     def __init__(self, path: Path) -> None:
         self._capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         fps = self._capture.get(cv2.CAP_PROP_FPS)
-        # Half a frame; of a film with pauses the rate, which is a mean of all, says nothing.
+        # Half a frame; the rate of a film with pauses is a mean of all, and of no use.
         half_ms = 500.0 / fps if 1e-3 < fps < 1e6 else 1.0
         self._tolerance_ms = min(half_ms, _MAX_TOLERANCE_MS)
-        self._next_ms = 0.0  # of the picture that a read would give, about
+        self._next_ms = 0.0  # approximate time of the next picture to be read
         self._lock = Lock()
 
     def image_at(self, timestamp_ns: int) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The picture of a capture time as BGR; None where the video has none then."""
+        """The picture of a capture time as BGR; None if the video has none then."""
         wanted_ms = timestamp_ns / 1e6
         with self._lock:
             if not self._next_ms - self._tolerance_ms <= wanted_ms <= self._next_ms + _AHEAD_MS:
