@@ -17,21 +17,21 @@ from stream_dmr.template.template import Template, simplified
 class Body(NamedTuple):
     """Points are the V vertices, the 3 keypoints and the M midline points, in this order.
 
-    The foot of a point is the nearest place on the midline. Points of one cross-section share it,
-    so what depends on the foot alone is worked out once for each of the U different `places`.
+    The foot of a point is the nearest place on the midline. The points of a cross-section share it,
+    so values that depend on the foot alone are computed once for each of the U different `places`.
     """
 
     points: Float[np.ndarray, "N 3"]
     places: Float[np.ndarray, "U 3"]  # the different feet
     place_of: Int[np.ndarray, "N"]  # of each point
     segments: Int[np.ndarray, "U"]  # midline segment of each place
-    fractions: Float[np.ndarray, "U"]  # where in its segment, 0 to 1
+    fractions: Float[np.ndarray, "U"]  # position within its segment, 0 to 1
     joints: Float[np.ndarray, "J 3"]
     midline: Float[np.ndarray, "M 3"]
     faces: Int[np.ndarray, "F 3"]
     edges: Int[np.ndarray, "E 2"]  # each once, in the direction in which its first face runs
     edge_faces: Int[np.ndarray, "E 2"]  # the faces that run along and against the edge
-    edge_starts: Int[np.ndarray, "V+1"]  # where each vertex's neighbors begin, and their end
+    edge_starts: Int[np.ndarray, "V+1"]  # index of each vertex's first neighbor, and the end
     neighbors: Int[np.ndarray, "2*E"]  # of each vertex along the edges, in the order of the edges
     face_neighbors: Int[np.ndarray, "F 3"]  # across the edges, in the order of the edges
     num_vertices: int
@@ -40,9 +40,9 @@ class Body(NamedTuple):
     def from_template(cls, template: Template, *, places_per_segment: int = 1000) -> "Body":
         """Bind a template's points to its midline.
 
-        Those whose feet are nearer than one part of a segment share their mean. 1000 parts bring
-        together what differs in the last bits of a file, the rings of a mesh that is made of them;
-        fewer make a mesh without rings faster to deform.
+        Points with feet nearer than one part of a segment share their mean. 1000 parts join points
+        that differ in the last bits of a file, such as the rings of a mesh made of rings; fewer
+        parts make a mesh without rings faster to deform.
         """
         points = np.concatenate([template.rest_vertices, template.keypoints, template.midline])
         segments, fractions = bind_to_midline(points, template.midline)
@@ -53,8 +53,8 @@ class Body(NamedTuple):
         fractions = where - segments
         start, step = template.midline[:-1], np.diff(template.midline, axis=0)
         edges, edge_faces = _edges(template.faces)
-        # Copies, since those of a recording are read-only: for numba that is another type of array,
-        # for which it would compile all kernels again.
+        # Copies, since arrays of a recording are read-only: numba treats that as another type, and
+        # would compile all kernels again.
         return cls(
             points=points,
             places=start[segments] + fractions[:, None] * step[segments],
@@ -117,9 +117,9 @@ _PLACES_PER_SEGMENT = 4
 
 
 class MeshLevels(NamedTuple):
-    """One template at three levels of detail; a level that needs no simplifying is the one above.
+    """One template at three levels of detail; a level without simplification is the one above.
 
-    The fewer faces, the fewer rim edges, which is where the time goes.
+    Fewer faces have fewer rim edges, which take most of the time.
     """
 
     full: Body  # the template's own mesh, which is recorded
@@ -155,7 +155,7 @@ JOINT_WEIGHT = slice(7, 13)
 NUM_PER_JOINT = 13
 
 # Radius of a joint's Gaussian before it is learnt, in body lengths. The paper gives none; chosen by
-# trial, so that those of neighbouring joints, a third of the body apart, overlap.
+# trial, so that the Gaussians of neighbouring joints, a third of the body apart, overlap.
 _REST_RADIUS = 0.25
 
 
@@ -169,7 +169,7 @@ class Joints(NamedTuple):
 
 
 class Priors(NamedTuple):
-    """Weights in the loss of half the squares of what priors hold near rest."""
+    """Weights in the loss of half the squares of parameters that priors hold near rest."""
 
     tilt: float  # of the sine of the body's angle with the plane that fish hang in
     joint: Float[np.ndarray, "13"]  # of each parameter of a joint

@@ -94,9 +94,9 @@ class FitMeshSettings(Settings):
 
     @property
     def scans_sizes(self) -> bool:
-        """True if a fit's size is what is to be expected rather than the likeliest.
+        """True if a fit's size is the expected size instead of the likeliest.
 
-        Only the spine's size is its length; and the paper's solver is left as the paper has it.
+        Only the spine's size is its length; and the paper's solver is left as in the paper.
         """
         return self._is_ours and self.scan_iterations > 0 and self.prior_weight > 0
 
@@ -116,15 +116,15 @@ class FitMeshSettings(Settings):
 
     @property
     def nat(self) -> float:
-        """A nat of likelihood in L_rec.
+        """The L_rec that is worth one nat of likelihood.
 
         With edges that are off by a pixel it is `prior_weight`, since the priors' halved squares
-        are nats by themselves. Rougher edges say less.
+        are nats themselves. Rougher edges contain less information.
         """
         return self.prior_weight * self.edge_std_px**2
 
     def priors(self) -> Priors:
-        """Of tilt, bends and skinning weights; joints' translations and scales have L_t and L_s."""
+        """Priors of tilt, bends and skinning weights; L_t and L_s hold joints' other parameters."""
         std = np.full(NUM_PER_JOINT, np.inf)
         std[JOINT_ROTATION] = self.twist_std_rad, self.arch_std_rad, self.bend_std_rad
         std[JOINT_WEIGHT] = self.weight_std

@@ -1,4 +1,4 @@
-"""One crop in, one fitted mesh out: warm from the frame before, else cold; then sized."""
+"""Fit one mesh to one crop: warm from the frame before, else cold; then find the expected size."""
 
 import time
 from typing import NamedTuple
@@ -41,13 +41,13 @@ from stream_dmr.template.template import Template
 
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
-# Of L_rec: what a cold fit must gain to replace the pose of the frame before, and with it the end
-# at which the head is. Chosen by trial.
+# L_rec that a cold fit must gain to replace the pose of the frame before, and with it the end at
+# which the head is. Chosen by trial.
 _CLEAR_GAIN = 0.01
 
 
 class Solved(NamedTuple):
-    """The likeliest fit of one crop, or why there is none."""
+    """The likeliest fit of one crop, or the reason why there is none."""
 
     target: Target | None
     solution: Solution | None
@@ -60,11 +60,11 @@ class Fit(NamedTuple):
     """The result of one crop."""
 
     mesh: FittedMesh
-    best: Float[np.ndarray, "P"] | None  # the likeliest parameters: where the next frame begins
+    best: Float[np.ndarray, "P"] | None  # the likeliest parameters: start of the next frame
 
 
 class Fitter:
-    """Fits one template to crops; holds nothing of any track."""
+    """Fits one template to crops; keeps no state of any track."""
 
     def __init__(
         self,
@@ -78,13 +78,13 @@ class Fitter:
     ) -> None:
         """`plane_normal`, in the camera frame, is of the plane that fish hang in; None: facing it.
 
-        With a `candidate`, the template is given that shape, and breadth is as free as it is
-        unknown; fits say its `index`. `with_covariance`: fits carry that of their parameters.
+        A `candidate` gives the template its shape, with a breadth as free as it is unknown; its
+        `index` is kept in the fits. `with_covariance`: fits contain the parameters' covariance.
         """
         normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
         self._index = index
         self._shape_covariance = individual_covariance()
-        self._breadth_std = 0.0  # of the log breadth, where it is learnt
+        self._breadth_std = 0.0  # of the log breadth, if it is learnt
         if candidate is not None:
             template = reshaped(template, candidate.coefficients)
             settings = freed(settings, std_of(TRUNK, candidate.covariance) ** 2)
@@ -115,7 +115,7 @@ class Fitter:
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
         """Fit the template to a crop's mask, starting from `best` of the frame before.
 
-        What can't be fitted comes back with its reason in `refusal`.
+        A crop that can't be fitted comes back with the reason in `refusal`.
         """
         return self.answer(crop, self.solve(crop, warm))
 
@@ -129,7 +129,7 @@ class Fitter:
         return Solved(target, solution, is_cold, None, began)
 
     def nats(self, solved: Solved) -> float:
-        """What a mask says against this shape, by which shapes can be compared; NaN: nothing."""
+        """Negative log likelihood of a mask, to compare shapes; NaN if it can't be computed."""
         if solved.target is None or solved.solution is None or not _is_finite(solved.solution):
             return float("nan")
         problem = Problem.from_settings(
@@ -188,9 +188,9 @@ class Fitter:
         return Reason.MASK_TOO_SMALL if area < self._settings.min_mask_px else None
 
     def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
-        """The warm fit if it is good, else a cold one where that is clearly better.
+        """The warm fit if it is good, else a cold fit if that is clearly better.
 
-        A warm start whose head is at the wrong end is not tried.
+        A warm start with its head at the wrong end is not tried.
         """
         solution = None
         if warm is not None and not is_reversed(warm, target.heading):
@@ -211,7 +211,7 @@ class Fitter:
         size_std: float | None,
         shape_std: float | None,
     ) -> FittedShape:
-        """`size_std` of the log size, where it is known better than by the covariance."""
+        """`size_std` of the log size, if it is known better than by the covariance."""
         parameters, v = solution.parameters, self._levels.full.num_vertices
         problem = self._problem(self._levels.full, target)
         terms, iou, rendering = evaluate(problem, parameters, True)
@@ -240,10 +240,10 @@ class Fitter:
         )
 
     def _hidden_slant_std(self, parameters: Float[np.ndarray, "P"]) -> float:
-        """Std of the log length by a slant that a breadth not known exactly may hide.
+        """Std of the log length by a slant that an uncertain breadth may hide.
 
-        A fish that shows its broad side would rather roll than slant, so this counts as far as it
-        can't roll: by the least breadth of its section over the one that it shows.
+        A fish that shows its broad side rather rolls than slants, so this counts as far as it can't
+        roll: by the least breadth of its section over the breadth that it shows.
         """
         if self._breadth_std == 0.0:
             return 0.0

@@ -1,7 +1,7 @@
-"""Which end of a fish is its head: the segmenter's cue in one frame, and a track's memory of it.
+"""Decide which end of a fish is its head, by the segmenter's cues along a track.
 
-A heading is the direction from tail to head in the picture, in rays, of any length; 0 where it is
-not known.
+A heading is the direction from tail to head in the picture, in rays, of any length; 0 if it is not
+known.
 """
 
 import math
@@ -15,8 +15,8 @@ from stream_dmr.camera import Camera
 from stream_dmr.fitting.body import ROOT_ROTATION
 from stream_dmr.messages import FishEnds
 
-# Added to the L_rec of a fit whose head is at the wrong end, when fits are compared. Chosen far
-# above what L_rec differs by between fits, so that such a fit wins only where there is no other.
+# Added to the L_rec of a fit with its head at the wrong end, when fits are compared. Chosen far
+# above the differences of L_rec between fits, so that such a fit wins only if there is no other.
 REVERSED_LOSS = 16.0
 _MIN_CONFIDENCE = 0.9  # a less confident cue is no cue; chosen
 # Most confidence in one frame's cue: a segmenter that errs is confident, and errs alike in many
@@ -27,7 +27,7 @@ _DECAY = 0.98
 
 
 def heading_from_ends(ends: FishEnds | None, crop_camera: Camera) -> Float[np.ndarray, "2"]:
-    """The heading that a segmenter's ends say; 0 where they are missing or too uncertain."""
+    """The heading by a segmenter's ends; 0 if they are missing or too uncertain."""
     if ends is None or not ends.confidence >= _MIN_CONFIDENCE:
         return np.zeros(2)
     head, tail = crop_camera.back_project(np.stack([ends.head_px, ends.tail_px]))[:, :2]
@@ -37,7 +37,7 @@ def heading_from_ends(ends: FishEnds | None, crop_camera: Camera) -> Float[np.nd
 def is_reversed(
     parameters: Float[np.ndarray, "*B P"], heading: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, "*B"]:
-    """True where a body of these parameters has its head at the other end than the heading."""
+    """True if a body of these parameters has its head at the other end than the heading."""
     if not heading.any():  # most are not known
         return np.zeros(parameters.shape[:-1], np.bool_)
     root = Rotation.from_rotvec(parameters[..., ROOT_ROTATION].reshape(-1, 3))
@@ -46,14 +46,14 @@ def is_reversed(
 
 
 class HeadTracker:
-    """Log odds along one track of which end is the head: a fish doesn't turn round in a frame."""
+    """Log odds along a track of which end is the head: a fish doesn't turn round in a frame."""
 
     def __init__(self) -> None:
         self._forward: np.ndarray | None = None  # tail to head of the last fit, 2 numbers
         self._log_odds = 0.0  # that this is right
 
     def correct(self, ends: FishEnds | None) -> FishEnds | None:
-        """A frame's cue, reversed where the frames before outweigh it; None without a cue."""
+        """A frame's cue, reversed if the frames before outweigh it; None without a cue."""
         if ends is None:
             return None
         forward = ends.head_px - ends.tail_px

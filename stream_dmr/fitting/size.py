@@ -1,13 +1,12 @@
-"""The expected size of a fish, given its mask, and how well a mask agrees with a shape.
+"""Compute the expected size of a fish from its mask, and the likelihood of a shape.
 
-A silhouette bounds the size of a fish on one side only. A fish that seems to be flat may be a
-slanting one that is longer, but not a shorter one; and a long fish, slanting and bent, can look
-like a short one in more ways than the other way round. The best fit alone is therefore too short on
-average, or wherever its search has led it. So sizes near it are tried, with everything else
-refitted, and the mean over all sizes is taken.
+A silhouette bounds the size of a fish on one side only. A fish that seems flat may be a longer,
+slanting fish, but not a shorter one; and a long fish, slanting and bent, can look like a short one
+in more ways than the other way round. The best fit alone is therefore too short on average. So
+sizes near it are tried, with everything else refitted, and the mean over all sizes is taken.
 
-Shapes are compared in all poses that are likely, not in the best one alone. A body that is too
-broad can always roll a little, one that is too narrow can't; but where it must roll, it must do so
+Shapes are compared in all likely poses, not in the best pose alone. A body that is too broad can
+always roll a little, but a body that is too narrow can't; and a body that must roll must do so
 exactly, so that fewer of its poses fit.
 """
 
@@ -38,9 +37,9 @@ _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at le
 def mean_and_std(
     offsets: Float[np.ndarray, "G"], nats: Float[np.ndarray, "G"]
 ) -> tuple[float, float]:
-    """Of the density exp(-nats) over log sizes, which between those tried is a smooth curve.
+    """Mean and std of the density exp(-nats) over log sizes, a smooth curve between those tried.
 
-    `offsets` ascend. Past them the curve goes on straight, and steeply enough.
+    `offsets` ascend. Past them the curve continues straight, and steeply enough.
     """
     last = len(offsets) - 1
     slopes = pchip_slopes(offsets, nats)
@@ -50,8 +49,8 @@ def mean_and_std(
         rising = max((nats[last] - nats[last - 1]) / (offsets[last] - offsets[last - 1]), rising)
     count = int(np.ceil((offsets[last] - offsets[0] + 2 * _BEYOND) / _STEP))
     likeliest = nats[0]
-    for one in nats:
-        likeliest = min(likeliest, one)
+    for value in nats:
+        likeliest = min(likeliest, value)
     total = first = second = 0.0
     k = 0
     for n in range(count):
@@ -73,8 +72,8 @@ def mean_and_std(
 def pchip_slopes(x: Float[np.ndarray, "G"], y: Float[np.ndarray, "G"]) -> Float[np.ndarray, "G"]:
     """Slopes with which cubic pieces neither overshoot nor turn where the points do not.
 
-    Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300 (1984); the ends by three points. That
-    of SciPy's PchipInterpolator, whose set-up alone would be a tenth of a warm fit.
+    Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300 (1984); the ends by three points. As in
+    SciPy's PchipInterpolator, whose set-up alone would be a tenth of a warm fit.
     """
     last = len(x) - 1
     slopes = np.zeros(len(x))
@@ -133,7 +132,7 @@ LOG_VOLUME_WEIGHT = 0.5
 # Std of a frame's error over that of the density, which is as wide as its priors; slant, bend and
 # misfit have parts of their own (localization/). Measured on 10,000 simulated frames: 0.5 to 0.67.
 STD_SCALE = 0.5
-# A scan ends at sizes this many nats less likely than the best fit's; those behind weigh less than
+# A scan ends at sizes this many nats less likely than the best fit's; sizes beyond weigh less than
 # exp(-8) = 0.03 %.
 _MAX_NATS = 8.0
 
@@ -150,7 +149,7 @@ class SizeScanner:
     ) -> tuple[Solution, float]:
         """The fit at the expected size of the fish, and the std of the log size.
 
-        `coarse`: that of the target, where it is at hand.
+        `coarse`: the coarse target, if it is at hand.
         """
         start, nat = best.parameters, self._settings.nat
         problem = self._problem(self._coarse, coarse or target.coarse())
@@ -169,16 +168,16 @@ class SizeScanner:
         return Problem.from_settings(self._settings, body, target, with_smoothness=False)
 
 
-# Cameras stand where the broad side of fish is seen. Chosen; of flatfish it is less.
+# Cameras see the broad side of most fish. Chosen; flatfish roll less.
 _ROLL_STD_RAD = 0.7
 
 
 def nats_against(problem: Problem, pose: Float[np.ndarray, "P"], *, nat: float) -> float:
-    """-log of the likelihood of a mask around a fitted pose, up to a constant: for comparisons.
+    """Negative log likelihood of a mask around a fitted pose, up to a constant: for comparisons.
 
-    The loss and its priors, that of the roll, and half the log determinant of their curvature
-    (Laplace's method), with the weight that it has in the scan of sizes. `nat` is the loss that
-    stands for one.
+    The loss and its priors, the prior of the roll, and half the log determinant of their curvature
+    (Laplace's method), with the weight that it has in the scan of sizes. `nat` is the loss that is
+    worth one nat.
     """
     priors = problem.priors._replace(roll=nat / _ROLL_STD_RAD**2)
     problem = problem._replace(priors=priors)

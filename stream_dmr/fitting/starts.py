@@ -1,4 +1,4 @@
-"""Start poses: cold ones from the mask, warm ones from the last frame."""
+"""Start poses: cold from the mask, warm from the last frame."""
 
 from itertools import product
 
@@ -36,13 +36,13 @@ _JOINT_SHARE = 1.25
 def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     """One start for each head end, roll and bend, placed and scaled by the mask's moments.
 
-    Where the target's heading is known, only those with their head at that end.
+    If the target's heading is known, only starts with their head at that end.
     """
     center_px, angle, extent_px = _moments(target.mask)
     focal = target.K[[0, 1], [0, 1]]
     num_joints = len(template.joints)
     flips, rolls, bends = np.array(list(product(_FLIPS_RAD, _ROLLS_RAD, _BENDS_RAD))).T
-    # A bent body is longer than it looks: the arc over the chord of a circle, 1 for a straight one.
+    # A bent body is longer than it looks: the arc over the chord of a circle, 1 if straight.
     length = extent_px / float(focal.mean()) / np.sinc(bends / (2 * np.pi))
     # The broad side (z toward or away from the camera) faces the camera when roll is 0.
     root = Rotation.from_euler("zx", np.stack([angle + flips, rolls], axis=1))

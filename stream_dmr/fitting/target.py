@@ -1,4 +1,4 @@
-"""What a fit gets and returns: the target of a mask, the solver, its solution.
+"""The input and output of a fit: the target of a mask, the solver, its solution.
 
 The signed distance map of a mask is exact and made in two passes, by Felzenszwalb and Huttenlocher,
 "Distance transforms of sampled functions", 2012: along the columns by counting, along the rows by
@@ -22,15 +22,15 @@ _NONE = 1 << 20  # no edge in this column; its square is still exact
 def signed_distance(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Distance in pixels to the mask's edge, negative inside: the map behind `boundary_loss`.
 
-    The edge lies half a pixel from the centres of the pixels on its two sides. All is infinitely
-    far from the edge of a mask that has none.
+    The edge lies half a pixel from the centres of the pixels on its two sides. If a mask has no
+    edge, all pixels are infinitely far from it.
     """
     return _along_rows(mask, _along_columns(mask))
 
 
 @compiled
 def _along_columns(mask: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
-    """Distance of each pixel to the nearest one of the other side in its column."""
+    """Distance of each pixel to the nearest pixel of the other side in its column."""
     height, width = mask.shape
     gap = np.full((height, width), _NONE, np.int32)
     for i in range(1, height):
@@ -50,7 +50,7 @@ def _along_rows(
 ) -> Float[np.ndarray, "H W"]:
     height, width = mask.shape
     signed = np.empty((height, width))
-    # The envelope: where its parabolas stand, their values at 0, and from where on each is lowest.
+    # The envelope: places of its parabolas, their values at 0, and from where on each is lowest.
     places, starts, froms = np.empty(width), np.empty(width), np.empty(width)
     for i in range(height):
         first = 0
@@ -74,7 +74,7 @@ def _envelope(
     starts: Float[np.ndarray, "W"],
     froms: Float[np.ndarray, "W"],
 ) -> int:
-    """Parabolas of one run of pixels; those of its two neighbours stand on the ground."""
+    """Parabolas of one run of pixels; the parabolas of its two neighbours stand on the ground."""
     count = 0
     for k in range(max(first - 1, 0), min(last + 2, len(gap))):
         is_own = first <= k <= last
@@ -129,13 +129,13 @@ class Target(NamedTuple):
     """Plain arrays, which kernels take as they are: `stream_dmr.compiled`."""
 
     K: Float[np.ndarray, "3 3"]
-    anchor: Float[np.ndarray, "3"]  # where the root rests: depth 1, in the middle of the crop
+    anchor: Float[np.ndarray, "3"]  # rest position of the root: depth 1, in the middle of the crop
     plane_normal: Float[np.ndarray, "3"]  # of the plane that fish hang in, camera frame
     heading: Float[np.ndarray, "2"]  # tail to head in the picture; 0: not known
     mask: Float[np.ndarray, "S S"]
-    # What something hides, which counts neither way; (0, 0) where nothing does, which is faster.
+    # Hidden pixels, which count neither way; (0, 0) if there are none, which is faster.
     unknown: Bool[np.ndarray, "U U"]
-    distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside, 0 where unknown
+    distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside, 0 if unknown
     mask_area: float  # px
     contour: Float[np.ndarray, "C 2"]  # points on the mask's edge, px
     contour_normals: Float[np.ndarray, "C 2"]  # outward
@@ -203,11 +203,11 @@ def _halved(picture: Float[np.ndarray, "S S"]) -> Float[np.ndarray, "S//2 S//2"]
 def mask_contour(
     mask: Bool[np.ndarray, "S S"], unknown: Bool[np.ndarray, "S S"] | None = None
 ) -> tuple[Float[np.ndarray, "C 2"], Float[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
-    """Points along the edge of a mask in pixels, unit outward normals, and each one's length.
+    """Points along the edge of a mask in pixels, unit outward normals, and each point's length.
 
-    The edge runs between the centres of the last pixels inside and the first ones outside, so the
-    traced pixels are moved half a pixel outward. Edges along the picture's border, and along what
-    is unknown, are left out: the fish may go on beyond them.
+    The edge runs between the centres of the last pixels inside and the first pixels outside, so the
+    traced pixels are moved half a pixel outward. Edges along the picture's border, and along
+    unknown pixels, are left out: the fish may continue beyond them.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     parts = [_edge(traced[:, 0], *mask.shape) for traced in contours if len(traced) >= _FEWEST]

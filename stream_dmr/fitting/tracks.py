@@ -1,7 +1,7 @@
-"""Fits along tracks: each begins where the frame before ended, its head where that one's was.
+"""Fit fish along tracks: each fit starts from the frame before, with its head at the same end.
 
-Of several candidate shapes a fish is given the one that its first good frames prefer, among those
-of its species' body form where a classifier is sure of the species.
+Of several candidate shapes a fish gets the one that its first good frames prefer, among the shapes
+of its species' body form if a classifier is sure of the species.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.species import SpeciesEvidence, SpeciesSettings, forms_of_species
 from stream_dmr.template.template import Template
 
-_DECIDING_FRAMES = 3  # good ones: each takes a fit of every candidate
+_DECIDING_FRAMES = 3  # good frames: each takes a fit of every candidate
 # Most evidence of one frame against a candidate, nats: its mask may be wrong. Chosen by trial.
 _MAX_AGAINST = 8.0
 _MIN_VISIBLE = 0.9  # of a frame that decides
@@ -29,10 +29,10 @@ _MIN_VISIBLE = 0.9  # of a frame that decides
 
 @dataclass(kw_only=True, slots=True)
 class _TrackState:
-    """What the next frame of a track starts from."""
+    """The state from which the next frame of a track starts."""
 
-    candidates: Sequence[int]  # the indices of those that it may be
-    against: Float[np.ndarray, "K"]  # nats against each of them
+    candidates: Sequence[int]  # the indices of its possible candidates
+    against: Float[np.ndarray, "K"]  # nats against each candidate
     log_sizes: Float[np.ndarray, "K"]  # by each of them, summed over the frames that said so
     num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
@@ -42,7 +42,7 @@ class _TrackState:
 
 
 class TrackFitter:
-    """Fits crops in the order of their capture; holds what each track knows."""
+    """Fits crops in the order of their capture; keeps the state of each track."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class TrackFitter:
         with_covariance: bool = False,
         species: SpeciesSettings | None = None,
     ) -> None:
-        """Fish hang as `[fit_mesh] hang` says.
+        """Fish hang as set by `[fit_mesh] hang`.
 
         `candidates` are shapes of the template; without any it has its own. ConfigError for a
         list of `species` that can't be read.
@@ -76,7 +76,7 @@ class TrackFitter:
             self.learn(candidates)
 
     def learn(self, candidates: CandidateShapes) -> None:
-        """Take candidates that begin with those known before; fish of before keep their own.
+        """Take more candidates, the known ones first; fish seen before keep their own.
 
         May be called while another thread fits.
         """
@@ -87,7 +87,7 @@ class TrackFitter:
         self._candidates = candidates
 
     def fit(self, crop: FishCrop) -> FittedMesh:
-        """Fit one crop; a poor fit, or one of half a fish, warms no other."""
+        """Fit one crop; a poor fit, or a fit of half a fish, starts no other fit."""
         if crop.track_id not in self._tracks:
             self._tracks[crop.track_id] = self._new_track(crop)
         track = self._tracks[crop.track_id]
@@ -136,9 +136,9 @@ class TrackFitter:
         self._decide(track, crop, solved)
         chosen = track.candidates[int(np.argmin(track.against + of_species))]
         if not crop.quality.touches_border:
-            for n, one in solved.items():  # the next frame begins where this one ended
-                if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
-                    track.best[n] = one.solution.parameters
+            for n, fit in solved.items():  # the next frame starts from this fit
+                if fit.solution is not None and fit.solution.iou >= self._settings.cold_below_iou:
+                    track.best[n] = fit.solution.parameters
         return self._answer(crop, solved[chosen], track, chosen)
 
     def _fit_by(self, chosen: int, crop: FishCrop, track: _TrackState) -> Fit:
@@ -155,7 +155,7 @@ class TrackFitter:
         return self.fitters[chosen].answer(crop, solved, form_std_ratio=std)
 
     def _of_species(self, track: _TrackState) -> Float[np.ndarray, "N"]:
-        """0 for the candidates that the species leaves, infinity for those that it excludes."""
+        """0 for the candidates of the species' body form, infinity for the others."""
         leaves = np.ones(len(track.candidates), bool)
         found = track.species.best()
         if found is not None and found.share >= self._species.min_share:
@@ -165,11 +165,11 @@ class TrackFitter:
         return np.where(leaves, 0.0, np.inf)
 
     def _decide(self, track: _TrackState, crop: FishCrop, solved: Mapping[int, Solved]) -> None:
-        """Count what a frame of the whole fish says against each candidate."""
+        """Add the evidence of a frame of the whole fish against each candidate."""
         if crop.quality.touches_border or crop.quality.visible_fraction < _MIN_VISIBLE:
             return
-        nats = np.array([self.fitters[n].nats(one) for n, one in solved.items()])
+        nats = np.array([self.fitters[n].nats(fit) for n, fit in solved.items()])
         if np.isfinite(nats).all():
             track.against += np.minimum(nats - nats.min(), _MAX_AGAINST)
-            track.log_sizes += [self.fitters[n].log_size(one) for n, one in solved.items()]
+            track.log_sizes += [self.fitters[n].log_size(fit) for n, fit in solved.items()]
             track.num_decided += 1

@@ -1,8 +1,8 @@
 """The uncertainty of a fit: the covariance of its parameters by the outline's own curvature.
 
-At the optimum each place of the visible rim says how far the outline moves across itself when a
+At the optimum each place of the visible rim shows how far the outline moves across itself if a
 parameter moves. With edges that are off by `edge_std_px` over stretches of `edge_correlation_px`,
-those are the rows of a linear least-squares problem whose normal matrix, with the prior, is the
+these are the rows of a linear least-squares problem whose normal matrix, with the prior, is the
 inverse of the covariance. A bend toward the camera moves the outline little and gets a large
 variance; so does the length of a fish that may be turned away.
 """
@@ -28,10 +28,10 @@ from stream_dmr.fitting.solver.outline import Rendering, Residuals, rim_slopes, 
 from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.solver.spine import Kind, jacobian
 
-# What is known of the parameters before any picture, as standard deviations: rotation (rad),
-# translation (body lengths) and log scale of the root and of a joint, logs of a joint's precision.
-# All are wide, so that the outline decides, but for the joints' scales and translations: the latter
-# have the std that L_t means. Chosen by trial; the scan of sizes needs none of them.
+# Stds of the parameters before any picture: rotation (rad), translation (body lengths) and log
+# scale of the root and of a joint, logs of a joint's precision. All are wide, so that the outline
+# decides, but for the joints' scales and translations: the latter have the std of L_t. Chosen by
+# trial; the scan of sizes needs none of them.
 _ROOT_STD = [2.0] * 3 + [1.0] * 2 + [1.0]
 _JOINT_ROTATION_STD, _JOINT_LOG_SCALE_STD, _JOINT_WEIGHT_STD = 1.0, 0.1, 1.0
 
@@ -54,8 +54,8 @@ def _prior_precisions(settings: FitMeshSettings, num_joints: int) -> Float[np.nd
     """One over the variances that the parameters have a priori."""
     joint = np.empty(NUM_PER_JOINT)
     joint[JOINT_ROTATION] = _JOINT_ROTATION_STD**-2
-    # L_t, lambda t^2 in nats, is t^2 precision / 2. Without priors L_rec is not in nats, and those
-    # of the default settings are taken.
+    # L_t, lambda t^2 in nats, is t^2 precision / 2. Without priors L_rec is not in nats, and the
+    # default settings' priors are taken.
     nat = settings.nat or FitMeshSettings().nat
     joint[JOINT_TRANSLATION] = 2 * settings.lambda_translation / nat
     joint[JOINT_LOG_SCALE] = _JOINT_LOG_SCALE_STD**-2
@@ -118,10 +118,10 @@ def _log_length_slope(
 
 
 def freed(settings: FitMeshSettings, breadth_variance: float) -> FitMeshSettings:
-    """Settings in which the joints' scales may differ by what isn't known of the breadth as well.
+    """Settings in which the joints' scales may also differ by the uncertainty of the breadth.
 
-    L_s = lambda (e^s - 1)^2 lets a log scale have the variance nat / (2 lambda), to which that of
-    the log breadth is added.
+    L_s = lambda (e^s - 1)^2 lets a log scale have the variance nat / (2 lambda), to which the
+    variance of the log breadth is added.
     """
     if breadth_variance == 0 or settings.lambda_scale == 0:
         return settings
@@ -135,10 +135,10 @@ _SLANTS_RAD = np.linspace(0.0, 1.2, 61)
 def slant_std_ratio(slant_rad: float, *, slant_std_rad: float, breadth_std: float) -> float:
     """Std of the log length by slant that hides behind a breadth known to `breadth_std` (log).
 
-    A fish of length L that slants by t is seen L cos t long, as one whose breadth is exp(t^2 / 2)
-    times as large. So a body that is taken for too broad is fitted without slant, and the slope of
-    its length to its shape, of `shape_std_ratio`, is nil. Here the slant has its prior and the
-    breadth makes good for the rest.
+    A fish of length L that slants by t looks L cos t long, like a fish whose breadth is
+    exp(t^2 / 2) times as large. So a body that is taken for too broad is fitted without slant, and
+    the slope of its length to its shape, of `shape_std_ratio`, is nil. Here the slant has its
+    prior, and the breadth accounts for the rest.
     """
     lengths = -np.log(np.cos(_SLANTS_RAD))
     broader = lengths + np.log(np.cos(min(abs(slant_rad), _SLANTS_RAD[-1])))
@@ -156,25 +156,25 @@ def shape_std_ratio(
 ) -> float:
     """Std of the log length of a fitted mask by this covariance of the shape's coefficients.
 
-    Where the pose is refitted, H_pp dp + H_ps ds = 0, so the length moves by the row of the log
-    size in -H_pp^-1 H_ps. All frames of a fish move alike, so the std does not average out.
+    If the pose is refitted, H_pp dp + H_ps ds = 0, so the length moves by the row of the log size
+    in -H_pp^-1 H_ps. All frames of a fish move alike, so the std does not average out.
     """
     H = shape_equations(problem, parameters, directions).H
     num_pose = len(parameters)
     unit = np.zeros(num_pose)
     unit[LOG_SIZE] = 1.0
-    # Only one row of the inverse is wanted; what nothing determines moves nowhere.
+    # Only one row of the inverse is needed; undetermined parameters don't move.
     pose_H = H[:num_pose, :num_pose] + 1e-12 * np.eye(num_pose)
     slope = -np.linalg.solve(pose_H, unit) @ H[:num_pose, num_pose:]
     return float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
 
 
 def form_std_ratio(log_sizes: Float[np.ndarray, "K"], nats: Float[np.ndarray, "K"]) -> float:
-    """Std of a log size since any of K shapes may be the fish's own.
+    """Std of a log size if any of K shapes may be the fish's own.
 
-    The second term of the law of total variance: that of the sizes by each shape, weighed by its
-    probability, exp(-nats) over their sum. The first is the variance by the likeliest shape. `nats`
-    may be infinite.
+    The second term of the law of total variance: the variance of the sizes by each shape, weighed
+    by its probability, exp(-nats) over their sum. The first term is the variance by the likeliest
+    shape. `nats` may be infinite.
     """
     weights = np.exp(nats.min() - nats)
     weights /= weights.sum()

@@ -115,13 +115,13 @@ class Objective:
 # First steps of Adam in each kind of parameter, in its own unit (rad, body lengths, log).
 ROOT_STEPS = [0.06] * 3 + [0.01] * 2 + [0.02]
 JOINT_STEPS = [0.06] * 3 + [0.003] * 3 + [0.01] + [0.06] * 6
-STEP_DECAY = 0.97  # of the steps, per iteration: large ones find the pose, small ones the outline
+STEP_DECAY = 0.97  # of the steps, per iteration: large steps find the pose, small ones the outline
 # Iterations between two checks for an end; of every start in a search; starts that are finished.
 # All numbers of the descent were chosen by trial: the paper gives none.
 _CHECK_EVERY = 10
 _SEARCH_ITERATIONS = 40
 _NUM_FINISHED = 3
-# First steps, relative to those above: near the answer they are smaller.
+# First steps, relative to the steps above: near the answer they are smaller.
 NEAR, FAR = 0.3, 1.0
 
 
@@ -129,13 +129,13 @@ class AdamSolver:
     """Gradient descent on the differentiable silhouette (Kingma and Ba, "Adam", ICLR 2015)."""
 
     def __init__(self, template: Template, settings: FitMeshSettings) -> None:
-        """Raises ConfigError where the settings name a device that is not there."""
+        """Raises ConfigError if the settings name a device that is not there."""
         if settings.device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
                 "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
                 'device = "cuda", found none; set device = "cpu"'
             )
-        # Tensors this small gain nothing from threads, and wait for them where cores are busy.
+        # Tensors this small gain nothing from threads, and wait for them if cores are busy.
         torch.set_num_threads(1)
         self._rig = Rig.from_template(template, device=settings.device)
         self._settings = settings
@@ -144,7 +144,7 @@ class AdamSolver:
         return self.descend(target, start[None], self._settings.adam_iterations, NEAR)[0]
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
-        """A few iterations from every start, the best ones to the end, the best of these."""
+        """A few iterations from every start, the best few to the end, the best of these."""
         rough = self.descend(target, starts, _SEARCH_ITERATIONS, FAR)
         rough.sort(key=lambda solution: rank(target, solution))
         best = np.stack([solution.parameters for solution in rough[:_NUM_FINISHED]])

@@ -219,7 +219,7 @@ def silhouette(
 ) -> Float[Tensor, "B S S"]:
     """Covered share in [0, 1] of each pixel of a square picture; differentiable in the vertices.
 
-    Exact but where two different outlines pass through one pixel of a folded body. After the
+    Exact unless two different outlines pass through one pixel of a folded body. After the
     signed-area accumulation of font rasterizers; its derivative is the boundary integral of the
     rim's normal velocity (Reynolds' transport theorem).
     """
@@ -230,13 +230,13 @@ def silhouette(
     return layers.clamp(0.0, 1.0)
 
 
-# Left, right, top, bottom: cells for what lies outside the picture, and one more column that takes
-# what falls to the right of the last cell of a row.
+# Left, right, top, bottom: cells for areas outside the picture, and one more column for areas to
+# the right of the last cell of a row.
 _PADDING = (1, 2, 1, 1)
 
 
 class Rim(NamedTuple):
-    """Rim edges of a batch of meshes, directed so that the body lies on one and the same side."""
+    """Rim edges of a batch of meshes, directed so that the body lies on the same side of all."""
 
     batch: Int[Tensor, "N"]
     start: Int[Tensor, "N"]
@@ -316,7 +316,7 @@ def _cut(start: Tensor, end: Tensor, batch: Tensor, size: int) -> _Pieces:
 
 
 def _accumulate(start: Tensor, end: Tensor, pieces: _Pieces, num_batches: int, size: int) -> Tensor:
-    """Signed area to the right of each piece: partly in its own cell, fully in those after it."""
+    """Signed area to the right of each piece: partly in its own cell, fully in the cells after."""
     width = size + 3
     step = (end - start)[pieces.edge]
     fall = (pieces.t1 - pieces.t0) * step[:, 1]

@@ -1,7 +1,7 @@
-"""Candidate shapes of a run: what they are, whether fish can have them, whether a mesh agrees.
+"""Candidate shapes of a run: body forms and learnt stocks, and whether a mesh agrees with them.
 
-Masks that hold more than the fish teach its shape, too: where the line at the snout is in every
-mask, a long thin snout is learnt, and fish are measured from the end of the line.
+Masks that contain more than the fish distort its shape: if the line at the snout is in every mask,
+a long thin snout is learnt, and fish are measured from the end of the line.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,10 +27,10 @@ from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names, load_template
 
 AUTO = "auto"
-# The mesh of rings that is given the other forms' shapes; any bundled one would do.
+# The mesh of rings that takes the other forms' shapes; any bundled mesh would do.
 _BASE_FORM = "cod"
-_ALWAYS = np.iinfo(np.int64).min  # since when the body forms are known
-# How much likelier the form is that the user names, than each other one.
+_ALWAYS = np.iinfo(np.int64).min  # the time from which on the body forms are known
+# Odds of the form that the user names, against each other form.
 _NAMED_ODDS = 20.0
 
 
@@ -46,20 +46,20 @@ class CandidateShape(NamedTuple):
 
     name: str
     coefficients: Float[np.ndarray, "W"]
-    covariance: Float[np.ndarray, "W W"]  # of what isn't known of the stock's mean shape
-    share: float  # of the fish that are taken to have it
+    covariance: Float[np.ndarray, "W W"]  # of the stock's mean shape
+    share: float  # of the fish that are assumed to have it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CandidateShapes:
-    """All of a run, in one order: `FittedShape.candidate` is an index."""
+    """All candidates of a run, in one order: `FittedShape.candidate` is an index."""
 
     names: str  # joined by commas
     coefficients: Float[np.ndarray, "N W"]
     covariances: Float[np.ndarray, "N W W"]
-    shares: Float[np.ndarray, "N"]  # those known before the first fish sum to 1
+    shares: Float[np.ndarray, "N"]  # those of candidates known before the first fish sum to 1
     are_learnt: bool  # from the fish of a run before it measured them; False: body forms
-    # Capture times from which on fish may have each, for what a camera learns; None: always.
+    # Capture times from which on fish may have each shape, if a camera learns; None: always.
     since_ns: Int[np.ndarray, "N"] | None = None
 
     def __iter__(self) -> Iterator[CandidateShape]:
@@ -75,10 +75,9 @@ class CandidateShapes:
         return len(self) == 1 and not self.covariances.any()
 
     def choice(self, first_seen_ns: int) -> Choice:
-        """What a fish may be that is first seen then: all body forms, and the stocks known last.
+        """The candidates of a fish first seen then: all body forms, and the stocks known last.
 
-        What the stocks leave of the shares is the body forms': a catch may bring what was not yet
-        in it.
+        The body forms get the shares that the stocks leave: a catch may contain new species.
         """
         if self.since_ns is None:
             return Choice(range(len(self)), self.shares)
@@ -92,7 +91,7 @@ class CandidateShapes:
         return Choice(indices.tolist(), shares[indices])
 
     def extended(self, learnt: LearntShapes) -> "CandidateShapes":
-        """With what a camera has learnt; the others keep their indices."""
+        """With the shapes that a camera has learnt; the others keep their indices."""
         return self._joined(learnt, since_ns=learnt.timestamp_ns)
 
     def with_stocks(self, stocks: "CandidateShapes") -> "CandidateShapes":
@@ -114,7 +113,7 @@ class CandidateShapes:
         )
 
     def stocks(self) -> "CandidateShapes | None":
-        """Those learnt last, their shares of the fish that they were learnt from; None: none."""
+        """The stocks learnt last, with their shares of the fish learnt from; None without any."""
         if self.are_learnt:
             return self
         if self.since_ns is None:
@@ -153,10 +152,10 @@ def body_forms(template: Template, *, named: str | None = None) -> CandidateShap
 def load_shapes(
     name: str, *, on_notice: Callable[[str], None] = lambda notice: None
 ) -> tuple[Template, CandidateShapes | None]:
-    """What `--template` says: the mesh, and the shapes that fish may have.
+    """The mesh and the candidate shapes of `--template`.
 
-    `auto`: any body form. The name of a body form: that one, unless the masks say otherwise. A
-    mesh: None, its own shape alone; `on_notice` gets what was repaired and found of it. Raises
+    `auto`: any body form. The name of a body form: that form, unless the masks contradict it. A
+    mesh: None, its own shape alone; `on_notice` gets lines about repairs and points found. Raises
     TemplateError.
     """
     if name != AUTO and name not in bundled_names():
@@ -171,7 +170,7 @@ def mesh_form(template: Template) -> CandidateShapes:
 
 
 def given_mesh(template: Template) -> CandidateShapes:
-    """A mesh as it is, the user's word: fits by it are those without candidates."""
+    """A mesh as it is, as the user states; its fits are those without candidates."""
     return _of_mesh(template, np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)))
 
 
@@ -209,22 +208,22 @@ def _factor(log: float, more: str, less: str) -> str:
 
 
 # Squared distance to the nearest form, in its own std: of stocks that are as far from a form as
-# `form_precision` says, one in a thousand is further (chi-square).
+# `form_precision` allows, one in a thousand is further (chi-square).
 _MAX_DISTANCE = float(chdtri(NUM_COEFFICIENTS, 1e-3))
-# Of the fish; a smaller group is mostly one whose masks misled, and says little of its shape.
+# Share of the fish; a smaller group is mostly of misleading masks, and poor evidence of a shape.
 _MIN_SHARE = 0.1
 _NEVER = 1.5  # times that distance: no fish at all; between the two it is doubted more and more
 
 
 class Believed(NamedTuple):
-    """The shapes that fish of a run may have, by what was learnt."""
+    """The shapes that fish of a run may have, after learning."""
 
     shapes: CandidateShapes
-    doubts: list[str]  # about what was learnt, a line each
+    doubts: list[str]  # about the learnt shapes, a line each
 
 
 def believable(forms: CandidateShapes, stocks: CandidateShapes) -> Believed:
-    """The stocks that can be of fish; doubtful ones less certain, none of those that can't be.
+    """The stocks that can be of fish, doubtful ones with a larger covariance.
 
     In the place of stocks that can't be of fish, or of too few, a fish may have any of the forms.
     """
@@ -261,12 +260,12 @@ _NO_FISH = "don't have, so that these are measured as the form that each is most
 # (root mean square). Chosen between simulated stocks measured by their own mesh and by those of
 # other species: with a mesh that is off by more, intervals hold fewer than nine in ten lengths.
 _MAX_BREADTH, _MAX_OUTLINE = 0.08, 0.15
-_MAX_STD = 0.1  # that of one fish alone; more says that fish differ by more than one stock's do
+_MAX_STD = 0.1  # that of one fish alone; a larger std: fish differ by more than in one stock
 
 # How far the mean length may move from the mesh to the shape learnt from the fish, as a log ratio.
 # It may move as far as the std of that mean by the mesh, too. Chosen likewise.
 _MAX_SHIFT = 0.04
-_SHARED = 0.5  # of the variance of lengths, what all fish of a mesh share; chosen
+_SHARED = 0.5  # share of the variance of lengths that all fish of a mesh have in common; chosen
 
 
 class LengthShift(NamedTuple):
@@ -278,13 +277,13 @@ class LengthShift(NamedTuple):
 
     @property
     def off(self) -> float:
-        """Its size over the largest one that is allowed."""
+        """Its size over the largest allowed."""
         std_of_mean = self.std * float(np.sqrt(_SHARED + (1 - _SHARED) / self.num_fish))
         return abs(self.log_ratio) / max(_MAX_SHIFT, std_of_mean)
 
 
 def are_like_mesh(stocks: CandidateShapes) -> bool:
-    """True where the shapes learnt from fish, beginning at a mesh, are still about the mesh's."""
+    """True if the shapes learnt from fish, starting at a mesh, are still near the mesh's."""
     return all(map(is_like_mesh, stocks))
 
 

@@ -8,10 +8,10 @@ between knots the logs are linear. Length, midline, joints and keypoints are the
 Breadth and thickness of a stock are inferred although nobody knows how its fish are rolled. A
 silhouette shows the breadth b as sqrt(b^2 cos^2 r + t^2 sin^2 r) at a roll r, with the thickness t,
 and the length as its cosine at a slant. Both are second order, so that the equations of a bundle
-adjustment are blind to them, and no single fish tells a narrow body from a rolled one. All fish
-together do: roll only narrows and slant only shortens, so that what is seen is spread to one side
-of what is true. Rolls and slants are integrated out, with the spreads of both learnt. A fish that
-is bent out of the picture looks shorter too, and counts as slanted.
+adjustment are blind to them, and no single fish distinguishes a narrow body from a rolled one. All
+fish together do: roll only narrows and slant only shortens, so that the seen values are spread to
+one side of the true value. Rolls and slants are integrated out, with the spreads of both learnt. A
+fish that is bent out of the picture looks shorter too, and counts as slanted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,17 +26,17 @@ from stream_dmr.fitting.body import Body, bind_to_midline
 from stream_dmr.geometry import arc_lengths
 from stream_dmr.template.template import Template
 
-# Places along the midline, 0 at the snout and 1 at the tail keypoint: those of the tables in
-# template/body_forms.toml, at which a body form can be any other one exactly.
+# Places along the midline, 0 at the snout and 1 at the tail keypoint: the places of the tables in
+# template/body_forms.toml, at which a body form can become any other form exactly.
 BREADTH_KNOTS = np.array([0.03, 0.10, 0.20, 0.32, 0.45, 0.58, 0.70, 0.80, 0.87, 0.91, 0.96, 1.0])
-THICKNESS_KNOTS = np.array([0.1, 0.4, 0.8])  # a silhouette says little of it: head, trunk, peduncle
+THICKNESS_KNOTS = np.array([0.1, 0.4, 0.8])  # few, as silhouettes hide it: head, trunk, peduncle
 _NUM_SIDE, _NUM_THICKNESS = len(BREADTH_KNOTS), len(THICKNESS_KNOTS)
 LEFT, RIGHT = slice(0, _NUM_SIDE), slice(_NUM_SIDE, 2 * _NUM_SIDE)
 BREADTH = slice(0, 2 * _NUM_SIDE)
 THICKNESS = slice(BREADTH.stop, BREADTH.stop + _NUM_THICKNESS)
 LOBES = THICKNESS.stop
 NUM_COEFFICIENTS = LOBES + 1
-_TAIL_FROM = 0.9  # where the tail's fin begins
+_TAIL_FROM = 0.9  # the beginning of the tail's fin
 
 _NEAR_CENTER = 0.1  # body lengths: some rings of any template
 
@@ -54,9 +54,9 @@ _SIDES_STD = 0.1  # of one side against the other
 _THICKNESS_STD, _THICKNESS_STEP_STD = 0.3, 0.15
 _LOBES_STD = 0.02  # body lengths
 _MAX_ONE_SIDED = 9.0  # three std
-# How far individuals are from their stock: the breadth by 5 % and the thickness by 10 %, as the
-# spread of condition factors says (weight goes with their product; Froese, J. Appl. Ichthyol. 22,
-# 241 (2006) finds 10 to 15 % in weight at a length), single places of the outline by 3 % more.
+# How far individuals are from their stock: the breadth by 5 % and the thickness by 10 %, from the
+# spread of condition factors (weight goes with their product; Froese, J. Appl. Ichthyol. 22, 241
+# (2006) finds 10 to 15 % in weight at a length), single places of the outline by 3 % more.
 _INDIVIDUAL_BREADTH_STD, _INDIVIDUAL_THICKNESS_STD = 0.05, 0.1
 _INDIVIDUAL_KNOT_STD, _INDIVIDUAL_LOBES_STD = 0.03, 0.005
 
@@ -106,7 +106,7 @@ def roundness(template: Template) -> float:
 
 
 def coefficients_of(other: Template, template: Template) -> Float[np.ndarray, "W"]:
-    """The coefficients that make one mesh of rings another one of the same rings.
+    """The coefficients that turn one mesh of rings into another mesh of the same rings.
 
     Both as template/make_bundled.py makes them. Raises ValueError for other meshes.
     """
@@ -138,8 +138,8 @@ def form_precision() -> Float[np.ndarray, "W W"]:
 def distance_from_form(off: Float[np.ndarray, "W"]) -> float:
     """Squared distance of a shape from a body form in the std of stocks.
 
-    What one side alone has, such as a fin that is up in every mask, counts little: the body's two
-    sides are alike.
+    Differences of one side alone, such as a fin that is up in every mask, count little: the body's
+    two sides are alike.
     """
     mean = (off[LEFT] + off[RIGHT]) / 2
     both = off.copy()
@@ -178,7 +178,7 @@ def std_of(mean: Float[np.ndarray, "W"], covariance: Float[np.ndarray, "W W"]) -
 def with_std_of(
     covariance: Float[np.ndarray, "W W"], part: slice, mean: Float[np.ndarray, "W"], std: float
 ) -> Float[np.ndarray, "W W"]:
-    """The covariance with another std of the `mean` of a part, that of the rest as it was."""
+    """The covariance with another std of the `mean` of a part; the rest is unchanged."""
     together = np.zeros(NUM_COEFFICIENTS)
     together[part] = 1.0
     rest = np.eye(NUM_COEFFICIENTS) - np.outer(together, mean)
@@ -197,7 +197,7 @@ def individual_covariance() -> Float[np.ndarray, "W W"]:
 
 
 def _feet(template: Template) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V 3"]]:
-    """Of each vertex its place along the midline, 0 to 1, and the point of the midline there."""
+    """Each vertex's place along the midline, 0 to 1, and the point of the midline there."""
     points, midline = template.rest_vertices, template.midline
     segments, fractions = bind_to_midline(points, midline)
     feet = midline[segments] + fractions[:, None] * np.diff(midline, axis=0)[segments]
@@ -213,7 +213,7 @@ def _hats(place: Float[np.ndarray, "V"], knots: Float[np.ndarray, "K"]) -> Float
 def _weighed(
     weights: Float[np.ndarray, "V K"], values: Float[np.ndarray, "K"]
 ) -> Float[np.ndarray, "V"]:
-    """Weights @ values without BLAS, whose last bit depends on where in memory the arrays lie."""
+    """Weights @ values without BLAS, whose last bit depends on the arrays' place in memory."""
     return np.einsum("vk,k->v", weights, values)
 
 
@@ -226,8 +226,8 @@ def _lobe_share(
     return np.where(is_tail, np.minimum(reach, 1.0) ** 2, 0.0)
 
 
-# Of one frame's log breadth: 5 % by the individual, as in `space.individual_covariance`, the rest
-# by bends and edges. Chosen.
+# Std of one frame's log breadth: 5 % by the individual, as in `individual_covariance`, the rest by
+# bends and edges. Chosen.
 _FRAME_STD = float(np.hypot(0.05, 0.06))
 _FRAMES_WORTH = 2.0  # the frames of a fish are much alike
 _OUTLIERS = 1e-4  # density of a breadth that is none: a wrong mask
@@ -237,19 +237,19 @@ _ROLL_STDS_RAD = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.6])
 # The same of the slant, over the std that is set.
 _SLANT_FACTORS = np.array([0.3, 0.6, 1.0, 1.7, 2.8])
 _ROLLS_RAD, _SLANTS_RAD = np.linspace(0.0, np.pi / 2, 31), np.linspace(0.0, 1.2, 25)  # or less
-# Logs of the factors that are weighed, and of what a density is tabulated at.
+# Logs of the factors that are weighed, and the places of a density's table.
 _BREADTHS, _THICKNESSES = np.linspace(-0.8, 0.8, 81), np.linspace(-0.6, 0.6, 13)
 _ROUNDNESSES, _SEEN = np.linspace(-3.5, 1.2, 48), np.linspace(-2.6, 1.4, 101)
 
 
 class Proportions(NamedTuple):
-    """What is known of log factors on a stock's breadth and thickness."""
+    """Log factors on a stock's breadth and thickness, as a Gaussian."""
 
     breadth: float
     breadth_std: float
     thickness: float
     thickness_std: float
-    share: float = 1.0  # probability, where it is one of several things that may be so
+    share: float = 1.0  # probability, if it is one of several possibilities
 
 
 def infer_proportions(
@@ -259,10 +259,10 @@ def infer_proportions(
     slant_std_rad: float,
     before: Sequence[Proportions],
 ) -> Proportions:
-    """The log factors on a stock's breadth and thickness, from what each fish's frames show.
+    """The log factors on a stock's breadth and thickness, from the breadths in each fish's frames.
 
     `roundness` is the thickness of the body over its breadth, both at a factor of 1; `before` is
-    what may be so without these fish: one Gaussian for each body form.
+    the prior: one Gaussian for each body form.
     """
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
     counts = [len(values) for values in seen.values()]
@@ -276,7 +276,7 @@ def infer_proportions(
         log_roundnesses = np.log(roundness) + _THICKNESSES - breadth
         log_posterior[n] = _proportion_hats(_ROUNDNESSES, log_roundnesses) @ by_roundness
     k, t = _BREADTHS[:, None, None], _THICKNESSES[:, None]
-    log_posterior += np.log(sum(_density(one, k, t) for one in before) + _IMPOSSIBLE)
+    log_posterior += np.log(sum(_density(form, k, t) for form in before) + _IMPOSSIBLE)
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=2)
     posterior /= posterior.sum()
     return Proportions(
@@ -286,7 +286,7 @@ def infer_proportions(
 
 @lru_cache
 def _densities(slant_std_rad: float) -> Float[np.ndarray, "R X S"]:
-    """Of what is seen of a log breadth of 0, at each roundness, for each pair of spreads."""
+    """Densities of the seen log breadth if it is 0, at each roundness, for each pair of spreads."""
     slant_stds_rad = slant_std_rad * _SLANT_FACTORS
     slants = np.stack([_weights(_SLANTS_RAD, std) for std in slant_stds_rad], axis=1)
     rolls = np.stack([_weights(_ROLLS_RAD, std) for std in _ROLL_STDS_RAD], axis=1)
@@ -304,7 +304,7 @@ def _densities(slant_std_rad: float) -> Float[np.ndarray, "R X S"]:
 def _proportion_hats(
     grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"]
 ) -> Float[np.ndarray, "P G"]:
-    """By how much each point of an even grid counts where a table over it is read linearly."""
+    """The weight of each point of an even grid if a table over it is read linearly."""
     steps = (places.clip(grid[0], grid[-1])[:, None] - grid) / (grid[1] - grid[0])
     return np.maximum(0.0, 1.0 - np.abs(steps))
 
@@ -327,6 +327,6 @@ def _density(
 
 
 def _weights(angles: Float[np.ndarray, "A"], std: float) -> Float[np.ndarray, "A"]:
-    """Of a normal distribution; angles of both signs are alike, 0 has but one."""
+    """Weights of a normal distribution; angles of both signs are alike, 0 counts once."""
     weights = np.where(angles == 0.0, 0.5, 1.0) * np.exp(-0.5 * (angles / std) ** 2)
     return weights / weights.sum()

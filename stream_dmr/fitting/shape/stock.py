@@ -1,18 +1,18 @@
 """The mean shape of a stock, from frames of its fish: a bundle adjustment with a prior.
 
-Of every frame the pose is free; all fish of a stock share its shape s, from which individuals
+The pose of every frame is free; all fish of a stock share its shape s, from which individuals
 differ by a known covariance. At given poses the least-squares problem of a frame over pose and
 shape together has the pose eliminated by a Schur complement (Triggs et al., "Bundle Adjustment: a
-Modern Synthesis", 2000); the frames of a fish are averaged, for they are much alike; its own
+Modern Synthesis", 2000); the frames of a fish are averaged, as they are much alike; its own
 deviation is integrated out, which leaves each fish a Gaussian in s. Their product with the prior
-about a body form is solved, the template reshaped, the poses followed, and so on.
+about a body form is solved, the template reshaped, the poses refitted, and so on.
 
 A fish that is rolled by r about its own axis shows the breadth sqrt(b^2 cos^2 r + t^2 sin^2 r),
-with its breadth b and its thickness t. So a body that is too broad is fitted nearly as well, rolled
-away from the camera or arched, and no step of a descent leads back, since shape and pose would have
-to change together. Shapes are therefore learnt from square fits, as if fish were neither rolled,
-slanted, twisted nor arched: once of all frames, then of those that show the fish's broad side. The
-factors on breadth and thickness that turned fish hide are inferred for all of them at once
+with its breadth b and its thickness t. So a body that is too broad fits nearly as well, rolled away
+from the camera or arched, and no step of a descent leads back, since shape and pose would have to
+change together. Shapes are therefore learnt from square fits, as if fish were neither rolled,
+slanted, twisted nor arched: first from all frames, then from frames that show the fish's broad
+side. The factors on breadth and thickness that turned fish hide are inferred for all fish at once
 (`space.infer_proportions`).
 """
 
@@ -96,7 +96,7 @@ def _turned(pose: Float[np.ndarray, "P"], angle: float) -> Float[np.ndarray, "P"
     return turned
 
 
-# What is held near zero, by priors of these stds; chosen so that none of them can hide a per cent.
+# Stds of priors that hold angles near zero; chosen so that none of them can hide a per cent.
 _HELD_ROLL_RAD, _HELD_TILT_RAD = 0.03, 0.02
 _HELD_TWIST_RAD, _HELD_ARCH_RAD = 0.05, 0.05
 _ARCH = 1  # of a joint's rotation: about the axis across the fish, out of the picture
@@ -127,7 +127,7 @@ def square_problem(
 
 
 def square_pose(problem: Problem, pose: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
-    """The pose of a square fit, sought from an unrolled one."""
+    """The pose of a square fit, searched from an unrolled one."""
     return descend(problem, pose, np.zeros(len(pose), np.bool_), _OPTIONS).parameters
 
 
@@ -143,7 +143,7 @@ def shape_equations(
     parameters: Float[np.ndarray, "P"],
     directions: Float[np.ndarray, "V 3 W"],
 ) -> ShapeEquations:
-    """H and g of a fit by the spine; `directions` are those of its body's vertices."""
+    """H and g of a fit by the spine; `directions` are of its body's vertices."""
     rendering = evaluate(problem, parameters, False).rendering  # compiled once, for all
     return _equations(problem, parameters, rendering, directions)
 
@@ -184,7 +184,7 @@ def _carry(
     chosen: Int[np.ndarray, "C"],
     out: Float[np.ndarray, "C 3 W"],
 ) -> None:
-    """Where directions at rest point in the deformed body, as `spine_points` carries offsets."""
+    """Carry directions at rest into the deformed body, as `spine_points` carries offsets."""
     joints, num_joints = joints_of(parameters), len(body.joints)
     L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
@@ -208,22 +208,22 @@ def _carry(
                     out[c, i, k] += scale * carried * directions[n, m, k]
 
 
-# Fish of a stock hang that way more nearly on average than any one of them does.
+# Fish of a stock hang that way more nearly on average than any single fish does.
 _TILT_STD_RAD = 0.15
-# Of the joints' log scales in a square fit: while the outline is learnt, and while the breadth is
-# read off. Chosen.
+# Stds of the joints' log scales in a square fit: while the outline is learnt, and while the breadth
+# is read off. Chosen.
 _LEARNING_SCALE_STD, _READING_SCALE_STD = 0.1, 0.4
 # Chosen by trial, as the limits below.
 _MAX_ROUNDS = 12
 _BROADSIDE, _FEWEST_BROADSIDE = 0.12, 6  # log factor, frames
-_MAX_STEP = 0.25  # of a log factor in one round: directions are those of the shape at hand
+_MAX_STEP = 0.25  # of a log factor in one round: the directions are of the present shape
 _SETTLED = 0.01  # of a log factor
 _POSE_OPTIONS = Options(6, 1e-5, WARM_DAMPING)
 
 
 @dataclass(eq=False)
 class PosedTarget:
-    """One frame of a fish: what is fitted to, and the pose, which follows the shape."""
+    """One frame of a fish: its target, and its pose, which is refitted with the shape."""
 
     fish: int
     target: Target
@@ -243,7 +243,7 @@ class FormOdds(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stock:
-    """A mean shape with what is not known of it."""
+    """A mean shape with its covariance."""
 
     coefficients: Float[np.ndarray, "W"]
     covariance: Float[np.ndarray, "W W"]
@@ -272,8 +272,8 @@ class StockFitter:
     ) -> Stock:
         """The shape of the fish of these frames, a priori near a body form.
 
-        The outline is that of fish near `form`; how broad and thick they are, which turned fish
-        hide, may be near any of `odds` (default: that form alone).
+        The outline is near that of `form`; breadth and thickness, which turned fish hide, may be
+        near any of `odds` (default: that form alone).
         """
         odds = odds or FormOdds(form[None], np.ones(1))
         shape, _ = self._outline(frames, form, start)
@@ -311,7 +311,7 @@ class StockFitter:
     def nats(
         self, frames: Sequence[PosedTarget], shape: Float[np.ndarray, "W"]
     ) -> dict[int, float]:
-        """What each fish's frames say against a shape, on average; their poses follow it."""
+        """Each fish's mean nats against a shape; the poses of its frames are refitted."""
         body = Body.from_template(reshaped(self._template, shape))
         against: dict[int, list[float]] = {}
         for frame in frames:
@@ -321,9 +321,9 @@ class StockFitter:
     def _read(
         self, frames: Sequence[PosedTarget], shape: Float[np.ndarray, "W"], odds: FormOdds
     ) -> tuple[list[PosedTarget], Float[np.ndarray, "F"], Proportions]:
-        """Read each frame's breadth off a square fit that may be arched, and what all say.
+        """Read each frame's breadth off a square fit that may be arched, and infer the stock's.
 
-        Returns the fits, the logs of the factors on the breadth, and what is known of the stock's.
+        Returns the fits, the logs of the factors on the breadth, and the stock's proportions.
         """
         template = reshaped(self._template, shape)
         body, square = Body.from_template(template), [frame.unrolled() for frame in frames]
@@ -365,10 +365,10 @@ class StockFitter:
         seen: Float[np.ndarray, "F"],
         shape: Float[np.ndarray, "W"],
     ) -> tuple[dict[int, float], list[PosedTarget]]:
-        """What each fish says against a shape, and the better of two poses of each frame.
+        """Each fish's nats against a shape, and the better of two poses of each frame.
 
-        They follow the shape from where the frame was found, and from the square pose, rolled by
-        as much as the breadth that is seen says.
+        Poses are refitted from where the frame was found, and from the square pose, rolled by as
+        much as the seen breadth implies.
         """
         template = reshaped(self._template, shape)
         body, thin = Body.from_template(template), roundness(template)
@@ -378,7 +378,7 @@ class StockFitter:
             rolled = rolled_as_seen(flat.pose, float(log_breadth), thin)
             joints_of(rolled).log_scale[:] = 0.0
             starts = replace(frame), replace(frame, pose=rolled)
-            nats = [self._follow(body, one) for one in starts]
+            nats = [self._follow(body, start) for start in starts]
             best = int(np.argmin(nats))
             placed.append(starts[best])
             against.setdefault(frame.fish, []).append(nats[best])
@@ -409,7 +409,7 @@ class StockFitter:
         return A, b
 
     def _follow(self, body: Body, frame: PosedTarget) -> float:
-        """Refit a frame from its last pose; what its mask says against the shape, nats."""
+        """Refit a frame from its last pose; return its mask's nats against the shape."""
         problem = Problem.from_settings(self._settings, body, frame.target, with_smoothness=False)
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         frame.pose = descend(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
@@ -417,9 +417,9 @@ class StockFitter:
 
 
 def _broadside(frames: Sequence[PosedTarget], off: Float[np.ndarray, "F"]) -> Sequence[PosedTarget]:
-    """The frames that show about the whole breadth, or those nearest to it.
+    """The frames that show about the whole breadth, or the frames nearest to it.
 
-    `off`: log of what each shows over the stock's breadth. Edge-on, the outline is the thickness.
+    `off`: log of each seen breadth over the stock's. Edge-on, the outline is the thickness.
     """
     order = np.argsort(np.abs(off), kind="stable")
     num = max(int((np.abs(off) < _BROADSIDE).sum()), _FEWEST_BROADSIDE)
@@ -447,7 +447,7 @@ def without_pose(
 ) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]] | None:
     """The Schur complement: curvature and slope of the loss in the shape, the pose at its best.
 
-    None if a mask unlike any fish leaves a pose without a minimum: it tells no shape.
+    None if a mask unlike any fish leaves a pose without a minimum; it has no information.
     """
     pose, shape = slice(0, num_pose), slice(num_pose, None)
     try:

@@ -1,9 +1,9 @@
 """The stocks of a catch: groups of fish of one mean shape, learnt from frames of them all.
 
-Fish are grouped by the body form that each one's masks prefer. Two groups are one stock unless
-their masks distinguish them by more than the parameters that a second shape costs (Akaike's
-criterion). Then every fish is refitted with each stock's shape, and the stocks are learnt once
-more from their own.
+Fish are grouped by the body form that their masks prefer. Two groups are one stock unless their
+masks distinguish them by more than the parameters that a second shape costs (Akaike's criterion).
+Then every fish is refitted with each stock's shape, and the stocks are learnt once more from their
+own fish.
 """
 
 import os
@@ -34,7 +34,7 @@ R = TypeVar("R")
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """The results in the order of the items; where the caller stops, the rest is not computed."""
+    """The results in the order of the items; if the caller stops, the rest is not computed."""
     pool = ThreadPoolExecutor(os.cpu_count() or 1)
     try:
         yield from pool.map(function, items)
@@ -42,10 +42,10 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         pool.shutdown(cancel_futures=True)
 
 
-FRAMES_PER_FISH = 4  # far apart: more of one passage say little that is new
-_TRIED_PER_FISH = 8  # frames of which the best fitted are taken; chosen
+FRAMES_PER_FISH = 4  # far apart: more of one passage add little information
+_TRIED_PER_FISH = 8  # frames, of which the best fits are taken; chosen
 MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
-# Of a frame; chosen so that only masks of whole fish are learnt from.
+# Least visible part of a fish in a frame; chosen so that only whole fish are learnt from.
 _MIN_VISIBLE = 0.99
 _MIN_CONFIDENCE = 0.52  # of a mask that was found
 
@@ -65,14 +65,14 @@ class FishSamples:
     track_id: int
     candidate: int  # the shape that it was fitted with
     samples: list[Sample]
-    against: Float[np.ndarray, "N"]  # nats that its masks say against each shape there is
+    against: Float[np.ndarray, "N"]  # nats of its masks against each shape
 
 
 @dataclass
 class GoodCrops:
     """Crops of one fish that show it whole, evenly over all of them; memory is bounded."""
 
-    _stride: int = 1  # every how many good crops one is kept
+    _stride: int = 1  # one in so many good crops is kept
     _num_good: int = 0
     _kept: list[FishCrop] = field(default_factory=list)
 
@@ -89,12 +89,12 @@ class GoodCrops:
             self._kept, self._stride = self._kept[::2], 2 * self._stride
 
     def chosen(self) -> list[FishCrop]:
-        """A few that are far apart; none where the fish was never seen whole."""
+        """A few crops that are far apart; none if the fish was never seen whole."""
         return evenly(self._kept, _TRIED_PER_FISH)
 
 
 def good_crops(crops: Iterable[FishCrop]) -> list[list[FishCrop]]:
-    """An even choice of fish, and of each one's crops that show it whole."""
+    """An even choice of fish, and of the crops that show each of them whole."""
     tracks: dict[int, GoodCrops] = {}
     for crop in crops:
         tracks.setdefault(crop.track_id, GoodCrops()).add(crop)
@@ -110,10 +110,10 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
     return [items[place] for place in np.unique(places)]
 
 
-# The frames of a fish, far apart, determine its shape as two independent ones would.
+# The frames of a fish, far apart, determine its shape like two independent frames.
 _FRAMES_WORTH = 2.0
-# Of the evidence for a form, summed over the frames that decided it: they follow each other, so
-# that three are worth little more than one.
+# Weight of the evidence for a form, summed over the frames that decided it: they follow each other,
+# so that three are worth little more than one.
 _EVIDENCE_WORTH = 1 / 3
 # Most evidence of one fish for and against separating two groups, nats: a mask may be wrong. Chosen
 # by trial.
@@ -143,10 +143,10 @@ def learn_stocks(
     suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
-    """The stocks that these fish are of, the largest first; None where there are no fish.
+    """The stocks that these fish are of, the largest first; None if there are no fish.
 
-    Where the stocks found first are said to suffice, the fish are not refitted with their shapes,
-    which is half of the work.
+    If the stocks found first suffice, the fish are not refitted with their shapes, which is half of
+    the work.
     """
     if not fish:
         return None
@@ -167,9 +167,12 @@ def _shapes_of(groups: Sequence[_Group]) -> CandidateShapes:
     total = sum(group.num_fish for group in groups)
     shapes = [
         CandidateShape(
-            one.form.name, one.stock.coefficients, one.stock.covariance, one.num_fish / total
+            group.form.name,
+            group.stock.coefficients,
+            group.stock.covariance,
+            group.num_fish / total,
         )
-        for one in sorted(groups, key=lambda group: -group.num_fish)
+        for group in sorted(groups, key=lambda group: -group.num_fish)
     ]
     return CandidateShapes.of(shapes, are_learnt=True)
 
@@ -186,19 +189,19 @@ class _StockLearner:
         self._template, self._settings = template, settings
         self._plane_normal = np.ascontiguousarray(plane_normal)
         self._fitter = StockFitter(template, settings)
-        self._forms, self._against = forms, {one.track_id: one.against for one in fish}
+        self._forms, self._against = forms, {single.track_id: single.against for single in fish}
 
     def by_form(self, fish: Sequence[FishSamples]) -> list[_Group]:
         """One group of each form that any fish was fitted with."""
         frames: dict[int, list[PosedTarget]] = {}
-        for one in fish:
-            frames.setdefault(one.candidate, []).extend(
+        for single in fish:
+            frames.setdefault(single.candidate, []).extend(
                 PosedTarget(
-                    one.track_id,
+                    single.track_id,
                     Target.from_crop(sample.crop, plane_normal=self._plane_normal),
                     sample.pose,
                 )
-                for sample in one.samples
+                for sample in single.samples
             )
         forms = [*self._forms]
         return [
@@ -220,7 +223,7 @@ class _StockLearner:
         return groups
 
     def reassigned(self, groups: list[_Group]) -> list[_Group]:
-        """Each fish in the group whose shape its masks prefer, by a new search; stocks learnt."""
+        """Each fish in the group whose shape its masks prefer, by a new search; stocks relearnt."""
         searches = [self._search(group.stock.coefficients) for group in groups]
         shapes = [group.stock.coefficients for group in groups]
         shares = np.log([group.num_fish for group in groups])
@@ -234,7 +237,7 @@ class _StockLearner:
 
         for options in side_by_side(posed, by_fish.values()):
             nats = [
-                list(self._fitter.nats([replace(one) for one in option], shape).values())
+                list(self._fitter.nats([replace(frame) for frame in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
             ]
             best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
@@ -262,7 +265,7 @@ class _StockLearner:
 
     def _odds(self, fish: Iterable[int]) -> FormOdds:
         """How probable each body form is by all that decided the forms of these fish."""
-        each = np.array([self._against[one] for one in sorted(fish)])
+        each = np.array([self._against[track_id] for track_id in sorted(fish)])
         # Finite, since fish of one stock may each rule out another form.
         against = np.minimum(each, each.min(axis=1, keepdims=True) + _RULED_OUT).sum(axis=0)
         nats = _EVIDENCE_WORTH * against - np.log(self._forms.shares)
@@ -306,10 +309,10 @@ def learn_shapes(
     suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
-    """The stocks that these fish are of; None where none of them is seen whole.
+    """The stocks that these fish are of; None if none of them is seen whole.
 
-    `crops` in the order of their capture; of each fish some that are far apart are fitted, with
-    each of the `forms` until one is chosen. `suffices`: see `learn_stocks`.
+    `crops` in the order of their capture; some crops of each fish that are far apart are fitted,
+    with each of the `forms` until one is chosen. `suffices`: see `learn_stocks`.
     """
     tracks = TrackFitter(
         template,
@@ -324,15 +327,15 @@ def learn_shapes(
         samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
         if not samples:
             return None
-        candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
+        candidate = fits[-1][1].candidate or 0  # the last fit is decided by all before it
         track_id = chosen[0].track_id
         against = tracks.against(track_id) + np.log(forms.shares)  # masks alone
         return FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against)
 
     fish: list[FishSamples] = []
-    for one in side_by_side(fitted, good_crops(crops)):
-        if one is not None:
-            fish.append(one)
+    for samples in side_by_side(fitted, good_crops(crops)):
+        if samples is not None:
+            fish.append(samples)
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
     return learn_stocks(

@@ -17,7 +17,7 @@ from stream_dmr.fitting.solver.descent import (
 from stream_dmr.fitting.solver.problem import Options, Problem, prior_loss
 from stream_dmr.fitting.target import Solution, Target, rank
 
-# Of a search: iterations of a round, and how many starts go into it at the most.
+# Rounds of a search: their iterations, and how many starts enter them at the most.
 _ROUNDS = ((2, 24), (4, 12))
 _NUM_FINISHED = 2
 
@@ -30,7 +30,7 @@ class ContourSolver:
         self._settings = settings
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        """From one start near the answer, and from its mirror image where that is more likely."""
+        """From one start near the answer, and from its mirror image if that is more likely."""
         problem = Problem.from_settings(self._settings, self._body, target, with_smoothness=True)
         found = self._finish(problem, start)
         mirrored = mirror(found.parameters)
@@ -88,8 +88,8 @@ def mirror(parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
     """The same body mirrored in depth, which from afar has the same silhouette.
 
     A body that is alike on both flat sides can't show which of its ends is nearer; only priors and
-    perspective can. Rotation vectors (x, y, z) become (-x, -y, z), and what couples the thickness
-    to the rest changes its sign.
+    perspective can. Rotation vectors (x, y, z) become (-x, -y, z), and parameters that couple the
+    thickness to the rest change their sign.
     """
     mirrored = parameters.copy()
     mirrored[ROOT_ROTATION][:2] *= -1

@@ -99,23 +99,23 @@ WARM_DAMPING, COLD_DAMPING = 1e-2, 1e-1
 # The damping is multiplied by these after a refused and an accepted step: raised fast and lowered
 # slowly, as by Press et al., "Numerical Recipes", 3rd ed., sec. 15.5, who have 10 and 0.1.
 _GROWTH, _SHRINK = 10.0, 0.3
-# Consecutive steps, each ten times shorter: what is left to gain is pixel noise.
+# Consecutive steps, each ten times shorter: only pixel noise is left to gain.
 _MAX_REFUSED = 3
 
 
 class Minimum(NamedTuple):
-    """Where a search ended."""
+    """The end of a search."""
 
-    parameters: Float[np.ndarray, "P"]  # the best ones
+    parameters: Float[np.ndarray, "P"]  # the best of the search
     loss: float  # their L_rec with the priors
     iou: float  # of the hard silhouette
     iterations: int
     stop: int  # why: index of STOP_REASONS
-    H: Float[np.ndarray, "P P"]  # curvature of the loss where the last step began, nothing held
+    H: Float[np.ndarray, "P P"]  # curvature of the loss at the start of the last step, nothing held
 
 
 class Iterate(NamedTuple):
-    """One iterate, with what the normal equations need again."""
+    """One iterate, with all that the normal equations need again."""
 
     terms: Float[np.ndarray, "6"]  # of eq. (3), before their lambdas
     iou: float  # of the hard silhouette
@@ -227,7 +227,7 @@ def factorise(
 ) -> Float[np.ndarray, "P P"]:
     """Lower triangular L with L L^T = H + damping diag H: H is a sum of squares, so it exists.
 
-    Rows and columns of what is held are those of the unit matrix.
+    Rows and columns of held parameters are those of the unit matrix.
     """
     L = H.copy()
     for p in range(len(H)):
@@ -270,10 +270,10 @@ class SizeScan(NamedTuple):
     """The best fits of G sizes."""
 
     parameters: Float[np.ndarray, "G P"]
-    losses: Float[np.ndarray, "G"]  # infinite where not tried
+    losses: Float[np.ndarray, "G"]  # infinite if not tried
     log_volumes: Float[np.ndarray, "G"]
     next_steps: Float[np.ndarray, "G P"]
-    start: Minimum  # that of the start's own size
+    start: Minimum  # at the start's own size
 
 
 def descend(
@@ -298,7 +298,7 @@ def scan_sizes(
 ) -> SizeScan:
     """Refit at each log size `start[LOG_SIZE] + offsets` (ascending, 0 among them).
 
-    From the start outwards, each size from where its neighbour's fit is headed, and no further than
+    From the start outwards, each size begins where its neighbour's fit is headed; the scan ends at
     sizes whose loss exceeds the start's by `max_excess`. `held` is `only_size`, for several sizes.
     """
     count, middle = len(offsets), 0
@@ -332,7 +332,7 @@ def scan_sizes(
 
 @compiled
 def _goes_on(n: int, before: int, losses: Float[np.ndarray, "G"], limit: float) -> bool:
-    """True where there is an n-th size, and the one before it is likely enough."""
+    """True if there is an n-th size, and the size before it is likely enough."""
     return 0 <= n < len(losses) and losses[before] < limit
 
 

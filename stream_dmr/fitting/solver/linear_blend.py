@@ -1,4 +1,4 @@
-"""The paper's linear blend skinning, and what both deformations share.
+"""The paper's linear blend skinning, and the kernels that both deformations share.
 
 Rotation vectors, their matrices and slopes: compiled loops.
 
@@ -6,7 +6,7 @@ The derivative of a rotated vector is d(R v) = R ((J_r d_omega) x v), with J_r t
 the rotation vector omega (Sola et al., "A micro Lie theory", 2018, eq. (143)).
 
 Skinning weights are a softmax of e_j, so that a blend X = sum_j W_j X_j has
-dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.body`.
+dX/de_j = W_j (X_j - X). The layout of the parameters is in `stream_dmr.fitting.body`.
 """
 
 from typing import NamedTuple

@@ -1,14 +1,11 @@
-"""Smoothness of the mesh and its slope to the parameters.
+"""Smoothness of the mesh, L_normal and L_lap of eq. (5), and its slope to the parameters.
 
-Slope of a function of the points to the parameters, from its slope to the points: J^T f.
+`pull_back` turns the slope of a function of the points into its slope to the parameters, J^T f. For
+a sum over all vertices this is many times quicker than their Jacobian. With forces f on the points,
+each cross-section of the spine transmits one push and one turn to its joints.
 
-For a sum over all vertices this is many times quicker than their Jacobian. With forces f on the
-points, each cross-section of the spine carries one push and one turn to its joints.
-
-L_normal and L_lap of eq. (5), and their slope to the parameters: compiled loops.
-
-Both are sums over the whole mesh, and their weights are small. As residuals they would cost more
-than all the rest of an iteration, so the normal equations get their gradient alone.
+Both terms are sums over the whole mesh, and their weights are small. As residuals they would cost
+more than all the rest of an iteration, so the normal equations get their gradient alone.
 """
 
 import numpy as np
@@ -36,8 +33,8 @@ def pull_back(
 ) -> Float[np.ndarray, "P"]:
     """J^T f of forces on the vertices; for the spine without the root's share, which is left at 0.
 
-    The spine's root moves, turns and scales the body as a whole: what depends on its form alone
-    does not change by that.
+    The spine's root moves, turns and scales the body as a whole, which does not change values that
+    depend on its form alone.
     """
     if kind is SPINE:
         return _through_spine(body, parameters, forces)
@@ -56,7 +53,7 @@ def _through_spine(
 ) -> Float[np.ndarray, "P"]:
     out = np.zeros(len(parameters))
     num_places, num_segments = len(body.places), len(body.midline) - 1
-    # Of each place and then each segment of the midline: sum of f, and of d f^T.
+    # For each place and then each segment of the midline: sum of f, and of d f^T.
     push = np.zeros((num_places + num_segments, 3))
     offsets = np.zeros((num_places + num_segments, 3, 3))
     _through_places(body, parameters, forces, push[:num_places], offsets[:num_places])
@@ -220,7 +217,7 @@ def smoothness(
 
 @compiled
 def neighbor_offsets(body: Body, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "V 3"]:
-    """Of each vertex from the mean of its neighbours."""
+    """Offset of each vertex from the mean of its neighbours."""
     starts, neighbors = body.edge_starts, body.neighbors
     offsets = np.empty((body.num_vertices, 3))
     for v in range(len(offsets)):
@@ -263,7 +260,7 @@ def smoothness_slope(
     normal_weight: float,
     laplacian_weight: float,
 ) -> Float[np.ndarray, "P"]:
-    """Slope of the weighted sum of both terms to the parameters, by what `smoothness` takes."""
+    """Slope of the weighted sum of both terms to the parameters, from `smoothness`'s results."""
     size = np.exp(parameters[LOG_SIZE])
     forces = np.zeros((body.num_vertices, 3))
     _normal_forces(body, points, normals, normal_weight, forces)
@@ -281,7 +278,7 @@ def _normal_forces(
     weight: float,
     forces: Float[np.ndarray, "V 3"],
 ) -> None:
-    """Slope of sum_e (1 - n_p . n_q), by that of each face's normal n = N / |N|, N = u x v."""
+    """Slope of sum_e (1 - n_p . n_q), by the slope of each face's normal n = N / |N|, N = u x v."""
     faces, beside = body.faces, body.face_neighbors
     for f in range(len(faces)):
         p0 = p1 = p2 = 0.0

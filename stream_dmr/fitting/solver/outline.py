@@ -34,7 +34,7 @@ class Rendering(NamedTuple):
     pixels: Float[np.ndarray, "V 2"]  # of the vertices
     rim: Int[np.ndarray, "R 2"]  # vertices of the edges between faces seen from the front and back
     covered: Float[np.ndarray, "S S"]  # share of each pixel
-    # Of faces, and of vertices from the mean of their neighbours; none of them without smoothness.
+    # Normals of faces, and offsets of vertices from their neighbours; empty without smoothness.
     normals: Float[np.ndarray, "F 3"]
     offsets: Float[np.ndarray, "V 3"]
 
@@ -120,7 +120,7 @@ def _add_row(
     height: float,
     sign: float,
 ) -> None:
-    """Signed area right of one piece of an edge within one row of pixels."""
+    """Add the signed area right of one piece of an edge within one row of pixels."""
     size = grid.shape[1]
     if xa > xb:
         xa, xb = xb, xa
@@ -151,7 +151,7 @@ def _add_row(
 
 @compiled
 def overlap(covered: Float[np.ndarray, "S S"], target: Target) -> tuple[float, float, float]:
-    """L_iou and L_boundary of eq. (3), and the hard IoU; what is unknown is left out of all."""
+    """L_iou and L_boundary of eq. (3), and the hard IoU, all without unknown pixels."""
     mask, distance, mask_area = target.mask, target.distance, target.mask_area
     unknown, is_hidden = target.unknown, len(target.unknown) > 0
     size = len(mask)
@@ -262,7 +262,7 @@ def pixel_slopes(
     slopes: Float[np.ndarray, "C 3 P"],
     target: Target,
 ) -> Float[np.ndarray, "C 2 P"]:
-    """Slopes of the chosen vertices' pixels to the parameters, from those of their points."""
+    """Slopes of the chosen vertices' pixels to the parameters, from the slopes of their points."""
     out = np.empty((len(chosen), 2, slopes.shape[2]))
     fx, fy = target.K[0, 0], target.K[1, 1]
     for c in range(len(chosen)):
@@ -276,7 +276,7 @@ def pixel_slopes(
     return out
 
 
-# Residuals under half a pixel, the mask's own staircase, have one weight.
+# Residuals under half a pixel, the mask's own staircase, have equal weights.
 _FLAT_PX = 0.5
 # A contour point belongs to rim edges whose normals are within 73 degrees of its own: less than 90,
 # so that the two sides of a narrow tail are kept apart. Chosen by trial, as the next one.
@@ -300,7 +300,7 @@ def contour_residuals(
     visible: VisibleRim,
     moved: RimSlopes,
 ) -> Residuals:
-    """Distances between rim and contour, both ways, with their slopes to what `moved` has."""
+    """Distances between rim and contour, both ways, with their slopes by the slopes in `moved`."""
     count = len(visible.edges) + len(target.contour)
     residuals = Residuals(
         np.empty((count, moved.slopes.shape[2])), np.empty(count), np.zeros(count)
@@ -343,7 +343,7 @@ def _rim_rows(
 
 @compiled
 def _look_up(field: Float[np.ndarray, "S S"], x: float, y: float) -> tuple[float, float, float]:
-    """Value and unit gradient of a distance field between pixels; it goes on outside."""
+    """Value and unit gradient of a distance field between pixels; it continues outside."""
     size = len(field)
     cx, cy = min(max(x, 0.0), size - 1.001), min(max(y, 0.0), size - 1.001)
     k, i = int(cx), int(cy)
@@ -418,7 +418,7 @@ def _contour_rows(
 def _segments(
     pixels: Float[np.ndarray, "V 2"], edges: Int[np.ndarray, "E 2"]
 ) -> tuple[Float[np.ndarray, "E 2"], Float[np.ndarray, "E 2"], Float[np.ndarray, "E"]]:
-    """Where each edge begins, where it leads, and one over its squared length."""
+    """Start of each edge, its direction, and one over its squared length."""
     starts, ways = np.empty((len(edges), 2)), np.empty((len(edges), 2))
     scales = np.empty(len(edges))
     for r in range(len(edges)):

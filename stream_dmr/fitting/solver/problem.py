@@ -31,7 +31,7 @@ IOU, BOUNDARY, SCALE, TRANSLATION, NORMAL, LAPLACIAN = range(6)
 class Problem(NamedTuple):
     """L_rec of eq. (3) of one body on one target, with priors on its parameters.
 
-    Kernels take it as it is: `stream_dmr.compiled`.
+    Kernels take it as an argument: `stream_dmr.compiled`.
     """
 
     body: Body
@@ -39,7 +39,7 @@ class Problem(NamedTuple):
     target: Target
     lambdas: Float[np.ndarray, "6"]
     priors: Priors
-    rest: Float[np.ndarray, "P"]  # where the priors have their minimum
+    rest: Float[np.ndarray, "P"]  # the minimum of the priors
 
     @classmethod
     def from_settings(
@@ -56,7 +56,7 @@ class Problem(NamedTuple):
 def _weights(
     settings: FitMeshSettings, with_smoothness: bool
 ) -> tuple[Float[np.ndarray, "6"], Priors]:
-    """The lambdas and priors of these settings: six problems of each crop have the same ones."""
+    """The lambdas and priors of these settings, equal for the six problems of each crop."""
     lambdas = settings.lambdas()
     if not with_smoothness:
         lambdas[[NORMAL, LAPLACIAN]] = 0.0
@@ -156,7 +156,7 @@ def regularise(
 
 @compiled
 def prior_loss(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
-    """What the priors add to L_rec: half the weighted squares of what they hold."""
+    """The priors' part of L_rec: half the weighted squares of the parameters that they hold."""
     R, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
     n, priors = problem.target.plane_normal, problem.priors
     loss = 0.5 * priors.tilt * (n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]) ** 2

@@ -209,12 +209,12 @@ def spine_nodes(
 def _at_place(
     body: Body, nodes: Float[np.ndarray, "M *shape"], u: int
 ) -> Float[np.ndarray, "*shape"]:
-    """Where a place of the midline has gone; also for slopes, which interpolate alike."""
+    """The moved place of the midline; also for slopes, which interpolate alike."""
     k, t = body.segments[u], body.fractions[u]
     return (1.0 - t) * nodes[k] + t * nodes[k + 1]
 
 
-# None is a type of its own, by which a kernel is compiled for one deformation and not for both.
+# None is a separate type, by which a kernel is compiled for one deformation and not for both.
 SPINE, LINEAR_BLEND = None, 1
 Kind = int | None
 KINDS: dict[str, Kind] = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
