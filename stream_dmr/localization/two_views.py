@@ -6,6 +6,9 @@ neither the plane nor a fit's slant matters. Its ends are the triangulated head 
 
 A fit that fails ends short: of a fish seen on edge it leaves out the tail. So the ends of a fit of
 low IoU weigh less, and where the two pictures contradict each other, those that are short do.
+
+A tail that the fish's own body hides is in neither picture, and nothing there contradicts. But the
+mesh of a fit knows how long a fish of this breadth is: a curve that is much shorter is doubted.
 """
 
 from collections.abc import Callable
@@ -27,7 +30,10 @@ _ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.005, 0.1
 # the share of it that the midline between the ends is off, across the body.
 _MISFIT_STD, _ACROSS_SHARE = 0.03, 0.2
 _SHORT = 0.7  # stds by which a picture may be short at both ends before they weigh less
-_DOUBT = 0.8  # misfit that adds as much to the length's std as the two pictures' errors
+_DOUBT = 1.5  # misfit that adds as much to the length's std as the two pictures' errors
+# How far a length is from those of the two meshes, as a log: what is usual, since a fit takes a
+# slant for a size, and the std for each part of it beyond. Chosen on simulated pairs.
+_MESH_USUAL, _MESH_SHARE = 0.05, 0.8
 _RIDGE_STD = 1.0  # of the curve's coefficients, over the length, but for place and direction
 # The same along the first camera's line of sight, which cameras that stand close together hardly
 # see: fish slant by some 17 degrees, and bend in depth as they do across it. Chosen.
@@ -45,6 +51,7 @@ class View(NamedTuple):
 
     midline_px: Float[np.ndarray, "M 2"]  # from head to tail, frame pixels
     calibration: Calibration
+    length_ratio: float  # of the fit's mesh, over its distance from the camera
     iou: float = 1.0  # of the fit, with its mask
 
 
@@ -54,7 +61,8 @@ class Placed:
 
     midline_mm: Float[np.ndarray, "S 3"]
     length_mm: float
-    length_std_mm: float  # by the two pictures' errors, and by how they contradict each other
+    # By the two pictures' errors, and by how they contradict each other and their fits' meshes.
+    length_std_mm: float
     misfit: float  # root mean square of the residuals, in the stds of good fits: 1 is expected
 
 
@@ -130,12 +138,24 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     J = slopes(residuals, coefficients)
     misfit = float(np.sqrt(np.mean(misses(coefficients, good) ** 2)))
     std_mm = float(np.sqrt(slope @ np.linalg.solve(J.T @ J, slope)))
+    line_mm, length_mm = dense @ coefficients.reshape(-1, 3), float(length(coefficients)[0])
+    meshes_mm = [
+        view.length_ratio * distance_mm(line_mm @ R.T + t)
+        for view, (R, t) in zip(views, frames, strict=True)
+    ]
+    off = abs(float(np.mean(np.log(length_mm / np.array(meshes_mm)))))
+    doubt_mm = _MESH_SHARE * max(off - _MESH_USUAL, 0.0) * length_mm
     return Placed(
-        midline_mm=dense @ coefficients.reshape(-1, 3),
-        length_mm=float(length(coefficients)[0]),
-        length_std_mm=std_mm * float(np.hypot(1, misfit / _DOUBT)),
+        midline_mm=line_mm,
+        length_mm=length_mm,
+        length_std_mm=float(np.hypot(std_mm * np.hypot(1, misfit / _DOUBT), doubt_mm)),
         misfit=misfit,
     )
+
+
+def distance_mm(midline_mm: Float[np.ndarray, "M 3"]) -> float:
+    """How far a midline is from the camera in whose frame it is."""
+    return float(np.linalg.norm(midline_mm.mean(axis=0)))
 
 
 def _at(line: Float[np.ndarray, "M D"], num: int) -> Float[np.ndarray, "S D"]:

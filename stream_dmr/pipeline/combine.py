@@ -15,8 +15,15 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
+from stream_dmr.geometry import arc_length
 from stream_dmr.localization.localize_fish import LocalizeSettings, localize, mask_std_ratio
-from stream_dmr.localization.two_views import View, place_between, rays_apart, second_from_first
+from stream_dmr.localization.two_views import (
+    View,
+    distance_mm,
+    place_between,
+    rays_apart,
+    second_from_first,
+)
 from stream_dmr.messages import FittedMesh, LocalizedFish
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.session import Setup
@@ -37,7 +44,7 @@ _COMPARED = 24  # tracks by which the clocks are compared
 _FEWEST = 3  # frames that two tracks must share to be one fish
 # Of the distance of the two cameras' rays to head and tail, over the fish's length: more is
 # another fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
-_MOST_RAYS_APART = 0.06
+_MOST_RAYS_APART = 0.09
 # What one camera refuses since it sees no depth, and two need not.
 _BY_ONE_CAMERA = ("", Reason.TURNED_AWAY, Reason.BENT_TOO_FAR)
 # Of both pictures' residuals, in their stds: more is another fish, or a camera that was moved.
@@ -52,6 +59,7 @@ class FishSightings(NamedTuple):
 
     times_ns: Int[np.ndarray, "T"]
     midlines_px: Float[np.ndarray, "T M 2"]
+    length_ratios: Float[np.ndarray, "T"]  # of the fits' meshes, over their distance
     ious: Float[np.ndarray, "T"]  # of the fits
     length_mm: float
 
@@ -60,8 +68,8 @@ class FishSightings(NamedTuple):
         begin, end = self.times_ns[0], self.times_ns[-1]
         return all(end < one.times_ns[0] or one.times_ns[-1] < begin for one in others)
 
-    def at(self, time_ns: int) -> tuple[Float[np.ndarray, "M 2"], float] | None:
-        """The midline at a time, between the frames around it, and the poorer one's IoU.
+    def at(self, time_ns: int, calibration: Calibration) -> View | None:
+        """What its camera saw of it at a time, between the frames around it; the poorer one's IoU.
 
         None too far from them.
         """
@@ -71,14 +79,20 @@ class FishSightings(NamedTuple):
         if max(t1 - t0, t0 - time_ns, time_ns - t1) > _MOST_APART_S * 1e9:
             return None
         share = 0.0 if t1 == t0 else (time_ns - t0) / (t1 - t0)
-        midline_px = (1 - share) * self.midlines_px[before] + share * self.midlines_px[after]
-        return midline_px, float(min(self.ious[before], self.ious[after]))
+        ratios = self.length_ratios
+        return View(
+            midline_px=(1 - share) * self.midlines_px[before] + share * self.midlines_px[after],
+            calibration=calibration,
+            length_ratio=float((1 - share) * ratios[before] + share * ratios[after]),
+            iou=float(min(self.ious[before], self.ious[after])),
+        )
 
 
 def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, FishSightings]:
     """The tracks of a run by their ids, of the frames that count."""
     times: dict[int, list[int]] = {}
     midlines: dict[int, list[Float[np.ndarray, "M 2"]]] = {}
+    ratios: dict[int, list[float]] = {}
     ious: dict[int, list[float]] = {}
     lengths: dict[int, list[float]] = {}
     for one in fish:
@@ -86,17 +100,23 @@ def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[i
             midline_px = calibration.camera.project(one.midline_mm)
             times.setdefault(one.track_id, []).append(one.timestamp_ns)
             midlines.setdefault(one.track_id, []).append(midline_px)
+            ratios.setdefault(one.track_id, []).append(_length_ratio(one.midline_mm))
             ious.setdefault(one.track_id, []).append(one.iou or 0.0)
             lengths.setdefault(one.track_id, []).append(one.length_mm)
     return {
         track_id: FishSightings(
             times_ns=np.array(times[track_id]),
             midlines_px=np.stack(midlines[track_id]),
+            length_ratios=np.array(ratios[track_id]),
             ious=np.array(ious[track_id]),
             length_mm=float(np.median(lengths[track_id])),
         )
         for track_id in times
     }
+
+
+def _length_ratio(midline_mm: Float[np.ndarray, "M 3"]) -> float:
+    return arc_length(midline_mm) / distance_mm(midline_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +191,11 @@ def _apart(
         ends_px = one.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
         rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)
         for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
-            seen = {n: others[column].at(time_ns) for n, time_ns in enumerate(times.tolist())}
-            both = {n: found[0][[0, -1]] for n, found in seen.items() if found is not None}
+            seen = {
+                n: others[column].at(time_ns, calibrations[1])
+                for n, time_ns in enumerate(times.tolist())
+            }
+            both = {n: view.midline_px[[0, -1]] for n, view in seen.items() if view is not None}
             if len(both) < _FEWEST:
                 continue
             other_rays = calibrations[1].camera.back_project(np.concatenate([*both.values()])) @ R
@@ -295,12 +318,16 @@ class LocalizeByTwo:
         if not others or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
         time_ns = mesh.timestamp_ns + round(self.pairing.offset_s * 1e9)
-        seen = next(filter(None, (self._second[other].at(time_ns) for other in others)), None)
-        if seen is None:
+        views = (self._second[other].at(time_ns, self._second_calibration) for other in others)
+        second = next((view for view in views if view is not None), None)
+        if second is None:
             return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
-        px = self._calibration.camera.project(alone.midline_mm)
-        first = View(px, self._calibration, alone.iou or 0.0)
-        second = View(seen[0], self._second_calibration, seen[1])
+        first = View(
+            midline_px=self._calibration.camera.project(alone.midline_mm),
+            calibration=self._calibration,
+            length_ratio=_length_ratio(alone.midline_mm),
+            iou=alone.iou or 0.0,
+        )
         placed = place_between((first, second), alone.midline_mm)
         if placed.misfit > _MOST_MISFIT:  # one of the cameras may take the head for the tail
             turned = second._replace(midline_px=second.midline_px[::-1])

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.geometry import arc_length
-from stream_dmr.localization.two_views import View, place_between, rays_apart, second_from_first
+from stream_dmr.localization.two_views import (
+    View,
+    distance_mm,
+    place_between,
+    rays_apart,
+    second_from_first,
+)
 from stream_dmr.simulation.rail_scene import second_camera
 
 FIRST = Calibration(
@@ -37,10 +43,12 @@ def bent_fish(bend_rad: float, turn: np.ndarray, length_mm: float = 700.0) -> np
 def seen(line_mm: np.ndarray, degrees: float) -> tuple[View, View]:
     second = second_camera(FIRST, degrees=degrees)
     R, t = second_from_first(FIRST, second)
-    return (
-        View(FIRST.camera.project(line_mm), FIRST),
-        View(second.camera.project(line_mm @ R.T + t), second),
+    lines = ((FIRST, line_mm), (second, line_mm @ R.T + t))
+    first, second = (
+        View(one.camera.project(line), one, arc_length(line) / distance_mm(line))
+        for one, line in lines
     )
+    return first, second
 
 
 @given(
@@ -91,7 +99,7 @@ def test_a_tail_that_one_camera_leaves_out_is_taken_from_the_other(degrees, shor
     views = [*seen(line, degrees)]
     good = place_between((views[0], views[1]), line)
     px = views[short].midline_px
-    views[short] = View(px[: round(0.85 * len(px))], views[short].calibration, iou=0.88)
+    views[short] = views[short]._replace(midline_px=px[: round(0.85 * len(px))], iou=0.88)
     placed = place_between((views[0], views[1]), line)
     assert placed.length_mm == pytest.approx(700, rel=0.02)
     assert placed.length_std_mm > 2 * good.length_std_mm
@@ -114,6 +122,40 @@ def test_what_both_pictures_leave_out_is_short_and_no_contradiction():
     placed = place_between(views, line)
     assert placed.length_mm == pytest.approx(arc_length(line[:-6]), rel=5e-3)
     assert placed.misfit < 0.3
+
+
+@pytest.mark.parametrize(("short", "size"), [(8, 1.0), (16, 1.0), (8, 0.5)])
+def test_a_tail_in_neither_picture_is_doubted_by_how_much_longer_the_meshes_are(short, size):
+    """A fish's own body may hide its tail from both: then nothing in the pictures contradicts."""
+    line = size * bent_fish(0.5, np.array([0.1, 0.1, 0.1]), 700.0)  # at half the size, half as far
+    whole = [view.length_ratio for view in seen(line, 35.0)]
+    first, second = seen(line[:-short], 35.0)
+    usual = place_between((first, second), line)
+    first, second = (
+        view._replace(length_ratio=ratio)
+        for view, ratio in zip((first, second), whole, strict=True)
+    )
+    placed = place_between((first, second), line)
+    assert placed.length_mm == usual.length_mm
+    missing = short / 64
+    assert placed.length_std_mm > usual.length_std_mm + 0.2 * missing * placed.length_mm
+
+
+def test_meshes_that_are_a_little_too_long_are_no_reason_to_doubt():
+    """A species' breadth is known to some percent."""
+    line = bent_fish(0.5, np.array([0.1, 0.1, 0.1]))
+    first, second = seen(line, 35.0)
+    stds = [
+        place_between(
+            (
+                first._replace(length_ratio=share * first.length_ratio),
+                second._replace(length_ratio=share * second.length_ratio),
+            ),
+            line,
+        ).length_std_mm
+        for share in (0.97, 1.0, 1.03)
+    ]
+    assert stds[0] == stds[1] == stds[2]
 
 
 @given(st.tuples(*[st.floats(-400, 400)] * 3), st.floats(10, 90), st.floats(5, 100))

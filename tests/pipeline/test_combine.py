@@ -226,6 +226,7 @@ def tracks(rng, degrees, offset_s):
             found[fish if found is first_tracks else fish + 10] = FishSightings(
                 times_ns=np.round(clock_s * 1e9).astype(np.int64),
                 midlines_px=np.stack([camera.camera.project(line) for line in lines]),
+                length_ratios=np.full(len(lines), 0.14),
                 ious=np.full(len(lines), 0.95),
                 length_mm=700.0,
             )
@@ -245,7 +246,7 @@ def test_tracks_that_broke_off_are_parts_of_the_other_cameras_fish():
     first, second, calibrations = tracks(np.random.default_rng(4), 35.0, 0.0)
     for found, whole, rest in ((first, 1, 7), (second, 12, 17)):
         one = found[whole]
-        parts = [FishSightings(*(x[s] for x in one[:3]), 700.0) for s in np.s_[:7, 7:]]
+        parts = [FishSightings(*(x[s] for x in one[:4]), 700.0) for s in np.s_[:7, 7:]]
         found[whole], found[rest] = parts
     pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)
     ids = {fish: sorted(others) for fish, others in pairing.ids.items()}
