@@ -44,7 +44,7 @@ _COMPARED = 24  # tracks by which the clocks are compared
 _FEWEST = 3  # frames that two tracks must share to be one fish
 # Of the distance of the two cameras' rays to head and tail, over the fish's length: more is
 # another fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
-_MOST_RAYS_APART = 0.09
+_MOST_RAYS_APART = 0.06
 # What one camera refuses since it sees no depth, and two need not.
 _BY_ONE_CAMERA = ("", Reason.TURNED_AWAY, Reason.BENT_TOO_FAR)
 # Of both pictures' residuals, in their stds: more is another fish, or a camera that was moved.
