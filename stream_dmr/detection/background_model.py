@@ -1,11 +1,11 @@
 """The background of a moving camera, and the camera's motion.
 
-A camera that is held by hand, rolls, pans or heaves is followed by what stands still before it:
-sparse optical flow (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000)
-and a similarity by RANSAC. A sea drifts, so the best similarity explains only part of what changes,
-and the vessel's rail, which it would move as well, stays in place. A camera's own motion explains
-nearly all changes everywhere. Accumulated over many pictures, this distinguishes a moving camera
-from a moving sea before a camera at rest.
+The motion of a camera that is held by hand, rolls, pans or heaves is found from the parts of the
+scene at rest: sparse optical flow (Bouguet, "Pyramidal implementation of the Lucas Kanade feature
+tracker", 2000) and a similarity by RANSAC. A sea drifts, so the best similarity explains only part
+of the changes, and the vessel's rail, which it would move as well, stays in place. A camera's own
+motion explains nearly all changes everywhere. Accumulated over many pictures, this distinguishes a
+moving camera from a moving sea before a camera at rest.
 
 The picture without fish is modelled pixel by pixel by a running mean, as in Stauffer and Grimson
 ("Adaptive background mixture models for real-time tracking", CVPR 1999) with one mode, that moves
@@ -34,7 +34,7 @@ _NOISE_LEVEL = 2.5  # grey levels: pictures that differ by less on average are n
 _MIN_EXPLAINED = 0.5  # of the changes, from which on the camera moves
 _EVIDENCE_DECAY = 0.95  # per picture
 _CELL_PX = 20  # the picture is compared in cells of this size
-_MIN_CELL_CHANGE = 1.5  # grey levels by which the motion must change a cell to tell anything
+_MIN_CELL_CHANGE = 1.5  # grey levels; cells that the motion changes by less are no evidence
 _MAX_UNMOVED_CHANGE = 0.6  # of that change; a cell that changed by less has not moved
 _MAX_UNMOVED_CELLS = 0.03  # of all cells; with more of them unmoved the camera is at rest
 _REST_FRAMES = 4  # skipped after a camera was found at rest
@@ -48,7 +48,7 @@ class CameraMotion:
     def __init__(self) -> None:
         self._before: UInt8[np.ndarray, "H W"] | None = None
         self._explained, self._changed = 0.0, 1e-9  # decaying sums over pictures
-        # Decaying counts by cell: of changes that the motion predicts, and of those missing.
+        # Decaying counts by cell: of changes that the motion predicts, and of missing changes.
         self._predicted, self._unmoved = np.zeros(()), np.zeros(())
         self._rest_frames = 0  # still to be skipped
 
@@ -57,7 +57,7 @@ class CameraMotion:
     ) -> Affine | None:
         """The similarity from the previous picture to this one, px; None for a camera at rest.
 
-        `is_background`: where the previous picture shows no fish.
+        `is_background`: the pixels of the previous picture without fish.
         """
         before, self._before = self._before, picture
         self._rest_frames = max(0, self._rest_frames - 1)
@@ -86,7 +86,7 @@ class CameraMotion:
     def _add_unmoved(
         self, changed: Float[np.ndarray, "h w"], predicted: Float[np.ndarray, "h w"]
     ) -> None:
-        """Count the cells that the motion would have changed, and those that did not change."""
+        """Count the cells that the motion would have changed, and the cells that did not change."""
         is_predicted = predicted > _MIN_CELL_CHANGE
         is_unmoved = is_predicted & (changed < _MAX_UNMOVED_CHANGE * predicted)
         self._unmoved = _EVIDENCE_DECAY * self._unmoved + is_unmoved
@@ -100,7 +100,7 @@ def estimate_similarity(
     is_background: Bool[np.ndarray, "H W"],
 ) -> Affine | None:
     """The similarity of most background features between two pictures, px; None without one."""
-    # OpenCV's stubs do not tell that these results may be None.
+    # OpenCV's stubs do not contain that these results may be None.
     points: Any = cv2.goodFeaturesToTrack(
         before,
         _MAX_FEATURES,
@@ -148,7 +148,7 @@ _TRIMMING_CORRECTION = 1.1  # full over trimmed second moments of a normal distr
 _NUM_TRIMMINGS = 4  # of the first picture's covariance; converged by then
 _INITIAL_WINDOW = 1 / 6  # of the longer side: a median over so much shows no fish
 _COVARIANCE_FRAMES = 10  # over which a region's covariance is learnt
-# What always changes, such as a shaking edge, may raise its own variance by so much.
+# Largest factor by which a place that always changes, such as a shaking edge, raises its variance.
 _MAX_VARIANCE_RATIO = np.float32(8)
 # Constants of compiled code; other types would make its sums float64.
 _ONE, _TWO = np.float32(1), np.float32(2)
@@ -176,7 +176,7 @@ class BackgroundModel:
             self._light, self._moments = self._region_statistics(picture, weight)
             self._precision = _precision(self._moments, self._size)
             weight = (self.distance(picture) < _MAX_INLIER_DISTANCE).astype(np.float32)
-        # What is not foreign is background as it is, with its texture.
+        # Pixels that are not foreign are background as they are, with their texture.
         is_background = self.distance(picture) < 3 * _MAX_INLIER_DISTANCE
         np.copyto(self.mean, picture, where=is_background)
         self._age[is_background] = 1
@@ -189,7 +189,7 @@ class BackgroundModel:
         self._age = cv2.warpAffine(self._age, affine, self._size, borderValue=-1)
 
     def fill_unseen(self, picture: Float32[np.ndarray, "3 H W"]) -> None:
-        """Take a picture as the mean where the view was not seen before."""
+        """Take a picture as the mean in places that were not in view before."""
         is_unseen = self._age < 0
         np.copyto(self.mean, picture, where=is_unseen)
         self._age[is_unseen] = 0
@@ -270,7 +270,7 @@ def _learn(
 ) -> None:
     """Move mean and variance ratio towards the picture, in place; increase the age.
 
-    At first a plain mean over the frames seen, later an exponential one.
+    At first a plain mean over the frames seen, later an exponential mean.
     """
     for i in range(variance_ratio.shape[0]):
         for j in range(variance_ratio.shape[1]):

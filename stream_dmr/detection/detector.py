@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float
 
 from stream_dmr.messages import Frame
 
-# Of how much something looks like a fish, 0 to 1. Nearly all simulated fish have more in most
+# Least score, 0 to 1, of a box that may be a fish. Nearly all simulated fish have more in most
 # frames, rock, light and plants in none; see docs/research/tracking.md.
 FISH_LIKE = 0.15
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Candidate:
-    """Something in one frame that may be a fish."""
+    """A possible fish in one frame."""
 
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels, inside the frame
     score: float  # 0 to 1
@@ -30,7 +30,7 @@ class Candidate:
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds candidates in consecutive frames; it may learn from earlier ones."""
+    """Finds candidates in consecutive frames; it may learn from earlier frames."""
 
     def find(self, frame: Frame) -> Sequence[Candidate]:
         """The candidates of one frame, in no particular order."""

@@ -1,11 +1,11 @@
-"""Fish by their motion and by their looks.
+"""Find fish by their motion and by their looks.
 
-Motion finds what a network has never seen, with an outline, and also plants that sway; it misses
-what hangs still, of a fish that fills the picture it sees parts, and of one behind a gaff two
-pieces. Looks find fish that don't move, and also marks that look like fish. What either finds is
-followed; what counts is decided by `tracking.confirmation`.
+Motion finds fish unlike any that the network has seen, with an outline, but also swaying plants. It
+misses fish that hang still, finds parts of a fish that fills the picture, and two pieces of a fish
+behind a gaff. Looks find fish that don't move, but also marks that look like fish. The finds of
+both are followed; `tracking.confirmation` decides which of them count.
 
-Most of a film is water, in which neither has to look at every picture: see `passes_over`.
+Most of a film is water, in which not every picture needs to be examined: see `passes_over`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,17 +24,17 @@ from stream_dmr.geometry import box_iou, fraction_inside, longer_side, whole_pix
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
 
-_MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
-# A box that has so much surely shows one whole fish, one with so much shows something of its own.
+_MIN_IOU = 0.3  # of a moving blob with the box that scores its looks
+# Least score of a box that surely shows a whole fish, and of a box that shows an object of its own.
 _SURE, _SEEN = 0.6, 0.3
 _MIN_INSIDE = 0.8  # of a piece of a fish, inside the fish's box
 _MIN_WHOLE_IOU = 0.5  # of all pieces together with that box
-# The part of the frame around a closer look: in sizes of what is looked at, and at least in px.
+# The part of the frame for a closer look: in sizes of the candidate, and at least in px.
 _SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
 
 
 class LookSettings(Settings):
-    """The part of `[detect_fish]` that says how often the detector "motion" looks at water."""
+    """The part of `[detect_fish]` about how often the detector "motion" looks at water."""
 
     look_every_s: float = Field(
         default=0.5,
@@ -46,7 +46,7 @@ class LookSettings(Settings):
 
 
 class FusedDetector:
-    """A `Detector` of what moves, and of what looks like fish."""
+    """A `Detector` of blobs that move and of boxes that look like fish."""
 
     def __init__(
         self, motion: MotionDetector, looks: Detector, settings: LookSettings | None = None
@@ -93,12 +93,16 @@ class FusedDetector:
         if self._must_look or moving:
             self._looked_ns = frame.timestamp_ns
         return [
-            replace(one, place_px=self._place(one, frame), looks=_looks(one.bbox_xyxy_px, seen))
-            for one in fuse(moving, seen)
+            replace(
+                found,
+                place_px=self._place(found, frame),
+                looks=_looks(found.bbox_xyxy_px, seen),
+            )
+            for found in fuse(moving, seen)
         ]
 
     def look_closer(self, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
-        """How much the content of a box looks like a fish in a picture of its surroundings alone.
+        """Score from 0 to 1 of a box as a fish, in a picture of its surroundings alone.
 
         What has less than 20 px in the detector's picture of the whole frame can't be told there.
         """
@@ -111,62 +115,62 @@ class FusedDetector:
         part = frame.image[top:bottom, left:right]
         return _looks(bbox_xyxy_px, [*find_in_view(self._looks, frame, part, (left, top))])
 
-    def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
-        middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2
+    def _place(self, candidate: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
+        middle = (candidate.bbox_xyxy_px[:2] + candidate.bbox_xyxy_px[2:]) / 2
         return np.asarray(self._motion.scene_point(middle, shape=frame.image.shape[:2]))
 
 
 def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
-    """What moves, whose outline is known, and what is seen where nothing moves."""
+    """The moving candidates, which have outlines, and those seen where nothing moves."""
     moving = _without_pieces(moving, seen)
     still = [
         fish
         for fish in seen
-        if not any(_show_the_same(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in moving)
+        if not any(_show_the_same(fish.bbox_xyxy_px, mover.bbox_xyxy_px) for mover in moving)
     ]
     return [*moving, *still]
 
 
 def _without_pieces(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
-    """What moves, with those that lie in one box of one fish joined to one."""
+    """The moving candidates, joined if they lie in the box of one fish."""
     found = list(moving)
-    for fish in sorted(seen, key=lambda one: -one.score):
+    for fish in sorted(seen, key=lambda candidate: -candidate.score):
         if fish.score < _SURE:
             break
-        others = [one for one in seen if one is not fish and one.score >= _SEEN]
-        pieces = [one for one in found if _is_piece(one, fish, others)]
+        others = [other for other in seen if other is not fish and other.score >= _SEEN]
+        pieces = [part for part in found if _is_piece(part, fish, others)]
         if len(pieces) > 1:
             whole = _join(pieces)
             if box_iou(whole.bbox_xyxy_px, fish.bbox_xyxy_px) >= _MIN_WHOLE_IOU:
-                found = [*(one for one in found if one not in pieces), whole]
+                found = [*(mover for mover in found if mover not in pieces), whole]
     return found
 
 
-def _is_piece(one: Candidate, fish: Candidate, others: Sequence[Candidate]) -> bool:
-    """True for what lies in a fish's box and doesn't rather look like another fish."""
-    box, whole = one.bbox_xyxy_px, fish.bbox_xyxy_px
+def _is_piece(candidate: Candidate, fish: Candidate, others: Sequence[Candidate]) -> bool:
+    """True if a candidate lies in a fish's box and doesn't look more like another fish."""
+    box, whole = candidate.bbox_xyxy_px, fish.bbox_xyxy_px
     alike = max(_MIN_IOU, box_iou(box, whole))
-    is_inside = one.foreground is not None and fraction_inside(box, whole) >= _MIN_INSIDE
+    is_inside = candidate.foreground is not None and fraction_inside(box, whole) >= _MIN_INSIDE
     return is_inside and not any(box_iou(box, other.bbox_xyxy_px) > alike for other in others)
 
 
 def _join(pieces: Sequence[Candidate]) -> Candidate:
     """One candidate with the silhouettes of all pieces."""
-    corners = np.array([whole_pixels(one.bbox_xyxy_px) for one in pieces])
+    corners = np.array([whole_pixels(piece.bbox_xyxy_px) for piece in pieces])
     left, top = corners[:, :2].min(axis=0)
     right, bottom = corners[:, 2:].max(axis=0)
     foreground = np.zeros((bottom - top, right - left), bool)
-    for one, (x0, y0, x1, y1) in zip(pieces, corners, strict=True):
-        foreground[y0 - top : y1 - top, x0 - left : x1 - left] |= one.foreground
+    for piece, (x0, y0, x1, y1) in zip(pieces, corners, strict=True):
+        foreground[y0 - top : y1 - top, x0 - left : x1 - left] |= piece.foreground
     box = np.array([left, top, right, bottom], np.float64)
     return replace(pieces[0], bbox_xyxy_px=box, foreground=foreground)
 
 
 def _looks(bbox_xyxy_px: Float[np.ndarray, "4"], seen: Sequence[Candidate]) -> float:
-    """How much the content of a box looks like a fish: the best score of the boxes around it."""
+    """Score from 0 to 1 of a box as a fish: the best score of the boxes that overlap it."""
     scores = (fish.score for fish in seen if _show_the_same(bbox_xyxy_px, fish.bbox_xyxy_px))
     return max(scores, default=0.0)
 
 
-def _show_the_same(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> bool:
-    return box_iou(one, other) >= _MIN_IOU
+def _show_the_same(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> bool:
+    return box_iou(box, other) >= _MIN_IOU

@@ -38,7 +38,7 @@ def open_annotated_fish(
     """Open a boxes file, a masks folder, or both; the boxes must have ids.
 
     `pictures`: the source of the frames, `across_frames`: False for stills, see `MaskFolder`.
-    Raises AnnotationError where one cannot be read or boxes have no ids.
+    Raises AnnotationError if a file cannot be read or boxes have no ids.
     """
     by_frame = None if boxes is None else load_boxes(boxes, pictures=pictures)
     for box in (box for found in (by_frame or {}).values() for box in found):
@@ -56,9 +56,9 @@ def open_annotated_fish(
 class AnnotatedFish:
     """A `FishFinder` that reads boxes and masks from files.
 
-    With boxes alone, masks are those that their file draws, the segmenter finds the others. With
-    masks alone, each id's tightest box is used. With both, the boxes decide which fish there are,
-    the masks alone what they look like; one without a mask gets an empty mask.
+    With boxes alone, masks that their file draws are used, and the segmenter finds the others. With
+    masks alone, each id's tightest box is used. With both, the boxes decide which fish there are
+    and the masks their shapes; a fish without a mask gets an empty mask.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class AnnotatedFish:
         masks: MaskFolder | None,
         across_frames: bool = True,
     ) -> None:
-        """`across_frames`: False for stills, where an id in several pictures is said."""
+        """`across_frames`: False for stills, in which repeated ids are reported."""
         self._boxes = boxes
         self._masks = masks
         self._last_frame = 0
@@ -81,7 +81,7 @@ class AnnotatedFish:
 
     @property
     def gives_masks(self) -> bool:
-        """True with a masks folder, and where there are boxes and each has a mask of its own."""
+        """True with a masks folder, and if there are boxes and each has a mask of its own."""
         boxes = [*chain.from_iterable((self._boxes or {}).values())]
         has_all = bool(boxes) and all(box.mask is not None for box in boxes)
         return self._masks is not None or has_all
@@ -127,8 +127,8 @@ class AnnotatedFish:
         return None
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
-        """All: every annotated object is a fish."""
-        return {one: [crop] for one, crop in crops.items()}
+        """All crops: every annotated object is a fish."""
+        return {track_id: [crop] for track_id, crop in crops.items()}
 
     @property
     def warnings(self) -> list[str]:
@@ -181,7 +181,7 @@ class AnnotatedFish:
         """The boxes that contain at least one pixel centre of the frame."""
         height, width = frame.image.shape[:2]
         inside = []
-        for box in (one.in_px(width, height) for one in boxes):
+        for box in (given.in_px(width, height) for given in boxes):
             x0, y0, x1, y1 = box.bbox_xyxy_px
             if x0 <= width - 1 and y0 <= height - 1 and x1 >= 1 and y1 >= 1:
                 inside.append(box)
@@ -217,7 +217,7 @@ PICTURE, FISH = "picture", "fish"
 
 
 def names_pictures(path: Path) -> bool:
-    """True for a CSV whose header speaks of `picture` and `fish`, whatever stands between them."""
+    """True for a CSV with the words `picture` and `fish` in its header, in any notation."""
     if path.suffix.lower() != ".csv" or not path.is_file():
         return False
     with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -228,11 +228,11 @@ def names_pictures(path: Path) -> bool:
 class NamedPictures:
     """A `FishFinder` of pictures that show one fish each; the same id is the same fish.
 
-    The fish is the largest thing that the detector finds, or of the masks folder all that is fish.
+    The fish is the largest candidate of the detector, or all fish pixels of the masks folder.
     """
 
     def __init__(self, path: Path, found_by: Detector | MaskFolder) -> None:
-        """Raises AnnotationError, with the line, where an id is no number from 1 on."""
+        """Raises AnnotationError, with the line, if an id is no number from 1 on."""
         self._fish = _read(path)
         self._masks = found_by if isinstance(found_by, MaskFolder) else None
         self._detector = found_by if isinstance(found_by, Detector) else None
@@ -290,7 +290,7 @@ class NamedPictures:
         ]
 
     def _box(self, frame: Frame) -> Float[np.ndarray, "4"]:
-        """Around the largest candidate; the whole picture where there is none."""
+        """The box of the largest candidate; the whole picture if there is none."""
         height, width = frame.image.shape[:2]
         found = [] if self._detector is None else self._detector.find(frame)
         boxes = [candidate.bbox_xyxy_px for candidate in found]
@@ -298,8 +298,8 @@ class NamedPictures:
         return boxes[int(np.argmax(areas))] if boxes else np.array([0.0, 0.0, width, height])
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
-        """All: every picture that is named shows a fish."""
-        return {one: [crop] for one, crop in crops.items()}
+        """All crops: every named picture shows a fish."""
+        return {track_id: [crop] for track_id, crop in crops.items()}
 
 
 _MAX_BYTES = 100_000_000  # a million pictures; chosen
@@ -340,7 +340,7 @@ def _read(path: Path) -> dict[str, int]:
 
 
 class BoxDetector:
-    """A `Detector` that gives the boxes of a file, clipped to the frame."""
+    """A `Detector` that returns the boxes of a file, clipped to the frame."""
 
     def __init__(self, frames: Mapping[int, Sequence[AnnotatedBox]]) -> None:
         self._frames = frames

@@ -18,13 +18,13 @@ from stream_dmr.files import open_file
 from stream_dmr.pictures import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
-# What Pillow raises for a PNG that it cannot decode; IndexError for one without pixels.
+# Pillow's errors for a PNG that it cannot decode; IndexError if it has no pixels.
 _DECODING_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, IndexError),
     Image.DecompressionBombError,
 )
-_MAX_LOOKED_AT = 20  # pictures, for ids where the first one has none
-_MIN_GREY_LEVELS = 8  # ids of a picture, from which on they are looked at; chosen
+_MAX_LOOKED_AT = 20  # pictures, in search of ids if the first picture has none
+_MIN_GREY_LEVELS = 8  # ids of a picture from which on they are checked for grey levels; chosen
 # Commands that make ids of white on black, in place: 1, and 1, 2, 3 ... picture by picture.
 _TO_ONE_FISH = (
     ".venv/bin/python -c \"import cv2, sys; [cv2.imwrite(p, (cv2.imread(p, 0) > 127).astype('u1')) "
@@ -39,7 +39,7 @@ _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palett
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What each pixel of a frame shows."""
+    """The fish id of each pixel of a frame."""
 
     ids: Integer[np.ndarray, "H W"]  # of a fish; 0: background, or unknown
     unknown: Bool[np.ndarray, "H W"] | None  # hidden by something in front; None: no such pixel
@@ -59,35 +59,35 @@ class Labels:
         ids = self.ids[self.window]
         if ids.dtype == np.uint8 and ids.size:  # counting is ten times as fast as sorting
             counts = cv2.calcHist([ids], [0], None, [256], [0, 256])
-            return [int(one) for one in np.flatnonzero(counts) if one > 0]
+            return [int(value) for value in np.flatnonzero(counts) if value > 0]
         return np.unique(ids[ids > 0]).tolist()
 
 
 class MaskFolder:
     """A folder of label pictures: a pixel's value is a fish's id, 0 is background.
 
-    They are named `000001.png` ... by frame, or like the pictures of a folder whose masks they are:
-    `IMG_7.png` for `IMG_7.jpg`; where every picture has a mask of its own name, it has that one.
-    The largest value of the type, 255 or 65535, is "unknown": what a gaff, a line or another fish
-    hides. Pictures are read on demand. Palette pictures give their indices, not their colours.
+    They are named `000001.png` ... by frame, or like the pictures of a folder: `IMG_7.png` for
+    `IMG_7.jpg`, if every picture has a mask of its own name. The largest value of the type, 255 or
+    65535, is "unknown": hidden by a gaff, a line or another fish. Pictures are read on demand.
+    Values of palette pictures are their indices, not their colours.
     """
 
     def __init__(
         self, folder: Path, *, pictures: Path | None = None, across_frames: bool = True
     ) -> None:
-        """`pictures`: the source of the frames; where it is a folder, masks may be named after it.
+        """`pictures`: the source of the frames; masks may have the names of a folder's pictures.
 
         `across_frames`: fish are in several frames; False: each picture stands for itself.
-        Raises AnnotationError where the folder is missing or holds no masks for these frames.
+        Raises AnnotationError if the folder is missing or holds no masks for these frames.
         """
         if not folder.is_dir():
             raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
         names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
         stems, own = set[str](), {Path(name).stem for name in names}
         if pictures is not None and pictures.is_dir():
-            files = (one for one in pictures.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES)
-            stems = {one.stem for one in files}
-        # Pictures may have numbers for names that are not those of their frames.
+            files = (file for file in pictures.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
+            stems = {file.stem for file in files}
+        # Pictures may have numbers as names that are not the numbers of their frames.
         is_named = bool(stems) and stems <= own
         self._is_numbered = not is_named and any(_FILE_NAME.fullmatch(name) for name in names)
         if not self._is_numbered and stems.isdisjoint(own):
@@ -102,7 +102,7 @@ class MaskFolder:
                 "rename them by one"
             )
         self.folder = folder
-        # Of its masks, where they are numbered; else of all its pictures.
+        # Names of its masks, if they are numbered; else of all its pictures.
         self._names = [n for n in names if not self._is_numbered or _FILE_NAME.fullmatch(n)]
         self._has_ids = False
         self._across_frames = across_frames
@@ -110,11 +110,11 @@ class MaskFolder:
     def labels(
         self, frame_index: int, *, width: int, height: int, picture: str = ""
     ) -> Labels | None:
-        """The labels of a frame of that size in px; None where the folder has none for it.
+        """The labels of a frame of that size in px; None if the folder has none for it.
 
         `picture`: the frame's file name, by which masks may be named. Raises AnnotationError for a
-        label picture in colour, of another size, of grey levels, or unreadable, and where none of
-        them has an id.
+        label picture in colour, of another size, of grey levels, or unreadable, and if none of them
+        has an id.
         """
         stem = f"{frame_index:06d}" if self._is_numbered else Path(picture).stem
         path = self.folder / f"{stem}.png"
@@ -152,9 +152,9 @@ class MaskFolder:
         return Labels(ids, is_unknown)
 
     def unused(self, last_frame: int) -> list[str]:
-        """A line where pictures are beyond the last frame; those named like pictures don't count.
+        """A line about numbered masks beyond the last frame; masks named like pictures don't count.
 
-        The pictures are not opened: one without any id counts as well.
+        The masks are not opened: a mask without any id counts as well.
         """
         frames = sorted(int(name[:-4]) for name in self._names) if self._is_numbered else []
         beyond = [index for index in frames if index > last_frame]
@@ -167,13 +167,13 @@ class MaskFolder:
         ]
 
     def _check_ids(self, largest: int) -> None:
-        """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
+        """Raise AnnotationError if fish are drawn as 255 on 0, which is "unknown"."""
         for name in self._names[:: max(1, len(self._names) // _MAX_LOOKED_AT)]:
             try:
                 with open_file(self.folder / name) as file, Image.open(file) as picture:
                     values = np.unique(np.asarray(picture))
             except _DECODING_ERRORS:
-                continue  # said where its frame comes
+                continue  # reported when its frame comes
             if ((values > 0) & (values < largest)).any():
                 return
         raise AnnotationError(
@@ -183,7 +183,7 @@ class MaskFolder:
 
     @property
     def _remedy(self) -> str:
-        """What makes ids of masks that show what is fish, and no more."""
+        """Advice on how to write masks of ids from masks of fish pixels."""
         if self._across_frames:
             return (
                 "write the mask of a single fish with the value 1: "
@@ -196,14 +196,14 @@ class MaskFolder:
 
 
 def are_grey_levels(labels: Labels) -> bool:
-    """True where most of many ids have no 3 x 3 pixels of their own anywhere, as no fish has.
+    """True if most of many ids have nowhere 3 x 3 pixels of their own, which no fish has.
 
     Measured: a soft edge has none in 4 of 5 values and more, overlapping fish in 1 of 10 at most.
     """
     if len(labels.present) < _MIN_GREY_LEVELS:
         return False
     ids = labels.ids[labels.window]
-    ids = ids if ids.dtype.itemsize <= 2 else ids.astype(np.float32)  # what OpenCV's filters take
+    ids = ids if ids.dtype.itemsize <= 2 else ids.astype(np.float32)  # for OpenCV's filters
     block = np.ones((3, 3), np.uint8)
     is_inside = cv2.erode(ids, block) == cv2.dilate(ids, block)
     num_with_inside = len(np.unique(ids[is_inside & (ids > 0)]))

@@ -25,9 +25,9 @@ from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
 
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
-_POLE_WIDTH = 1 / 50  # of the longer side; what is thinner throughout may be a gaff or a line
+_POLE_WIDTH = 1 / 50  # of the longer side; a blob that is thinner throughout may be a gaff or line
 _MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
-_MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller ones are fins and hooks
+_MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller parts are fins and hooks
 _MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
 _MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thicker
 _MIN_THICKNESS_PX = 3.5
@@ -46,8 +46,8 @@ def fish_blobs(
 ) -> tuple[list[Bool[np.ndarray, "H W"]], Counter[Refusal]]:
     """The connected components that may be fish, without connected poles and lines.
 
-    A thin component that reaches the edge of the picture is a pole or a line; a thin one inside may
-    be a fish seen edge-on. Also how many components were refused, by reason.
+    A thin component that reaches the edge of the picture is a pole or a line; a thin component
+    inside may be a fish seen edge-on. Also returns how many components were refused, by reason.
     """
     pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
     fish, refused = [], Counter[Refusal]()
@@ -57,7 +57,7 @@ def fish_blobs(
         x, y, w, h, area = stats[label].tolist()
         touches_edge = min(x, y, width - x - w, height - y - h) <= 1
         if area < _MIN_BODY_AREA * pole_px**2 and math.hypot(w - 1, h - 1) + 1 < min_length_px:
-            # Most of what moves is such specks; the rest would come to the same, by opening them.
+            # Most moving components are such specks; opening them would have the same result.
             refused[Refusal.THIN if touches_edge else Refusal.SHORT] += 1
             continue
         part = np.s_[y : y + h, x : x + w]
@@ -90,11 +90,11 @@ def _without_poles(
     if len(bodies) == 1 and max(blob.shape) <= body_px[0] + round(_MAX_END_LENGTH * body_px[0]):
         return [blob]
     fish = _with_ends(bodies, [round(_MAX_END_LENGTH * px) for px in body_px], region)
-    return [one[pole_px:-pole_px, pole_px:-pole_px] > 0 for one in fish]
+    return [blob[pole_px:-pole_px, pole_px:-pole_px] > 0 for blob in fish]
 
 
 def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[np.ndarray, "h w"]]:
-    """The largest component, and those that are nearly as large; a tail fin is not."""
+    """The largest component, and components nearly as large; a tail fin is smaller."""
     count, labels, stats = components(opened)
     areas = stats[1:, cv2.CC_STAT_AREA]
     least = max(min_area_px, _MIN_BODY_RATIO * max(areas, default=0))
@@ -121,7 +121,7 @@ def _with_ends(
 def _refusal(
     blob: Bool[np.ndarray, "h w"], min_length_px: float, max_length_px: float
 ) -> Refusal | None:
-    """None where length and mean thickness (area over length) are those of a fish."""
+    """None if length and mean thickness (area over length) are those of a fish."""
     points = cv2.findNonZero(blob.view(np.uint8))
     length_px = max(cv2.minAreaRect(points)[1]) + 1
     if length_px < min_length_px:
@@ -136,8 +136,8 @@ def _refusal(
 _MIN_CHANGE = 8  # grey levels between two pictures; less is noise
 _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
-_FOREIGN_RATE = 0.02  # of moving ones: errors of the model must fade at last
-_NEAR_THRESHOLD_RATIO = 0.65  # of the threshold, for pixels near those above it
+_FOREIGN_RATE = 0.02  # of moving pixels: errors of the model must fade at last
+_NEAR_THRESHOLD_RATIO = 0.65  # of the threshold, for pixels near pixels above it
 _NEAR_PX = 11  # diameter of "near"
 _IDENTITY = np.eye(2, 3)
 
@@ -204,7 +204,7 @@ class MotionDetector:
         return self._background_from_picture @ [*(point * scale), 1.0] / scale
 
     def _find_moving(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-        """True where a picture differs from its background and moves; learns the background."""
+        """The mask of pixels that differ from the background and move; learns the background."""
         background, aligned = self._align(small)
         picture = _planes(aligned)
         background.fill_unseen(picture)
@@ -273,7 +273,7 @@ class MotionDetector:
 def _find_foreign(
     distance: Float32[np.ndarray, "h w"], threshold: float
 ) -> UInt8[np.ndarray, "h w"]:
-    """1 in shapes above the threshold (std), and where pixels near them are almost above it."""
+    """1 in shapes above the threshold (std), and in pixels near them that are almost above it."""
     above = cv2.morphologyEx(_above(distance, threshold), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     almost = cv2.morphologyEx(
         _above(distance, _NEAR_THRESHOLD_RATIO * threshold), cv2.MORPH_OPEN, _disc(3)

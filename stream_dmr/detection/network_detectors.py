@@ -75,7 +75,7 @@ class Letterbox:
         x0, y0, x1, y1 = whole_pixels(bbox_xyxy_px)
         per_input = np.array(probability.shape[::-1]) / self.input_size
         scale = self.scale * per_input
-        # From the middle of a frame pixel of the box to that of a mask pixel.
+        # From the middle of a frame pixel of the box to the middle of a mask pixel.
         shift = scale * (np.array([x0, y0]) + 0.5) + self.offset * per_input - 0.5
         affine = np.column_stack([np.diag(scale), shift])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -111,7 +111,7 @@ class OnnxSettings(Settings):
 
 
 class OnnxDetector:
-    """A `Detector` of boxes and scores, and of masks where its layout has them."""
+    """A `Detector` of boxes and scores, and of masks if its layout has them."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class OnnxDetector:
         return self._settings.onnx_layout in MASKS
 
     def find(self, frame: Frame) -> list[Candidate]:
-        """The boxes of a frame after non-maximum suppression; none whose mask is empty."""
+        """The boxes of a frame after non-maximum suppression, without boxes with empty masks."""
         height, width = frame.image.shape[:2]
         letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=self._input_size)
         boxes, scores, outputs = self._run(letterbox.apply(frame.image))
@@ -218,7 +218,7 @@ class OnnxDetector:
         return scores[:, classes]
 
     def _try(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Raise ModelError where the model fails on a picture or gives impossible outputs."""
+        """Raise ModelError if the model fails on a picture or has impossible outputs."""
         layout = self._settings.onnx_layout
         try:
             boxes, scores, _ = self._run(picture)

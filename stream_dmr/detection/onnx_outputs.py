@@ -1,4 +1,4 @@
-"""What ONNX detectors put out, by their layout: boxes, scores and masks.
+"""Read the outputs of ONNX detectors by their layout: boxes, scores and masks.
 
 yolo: (1, 4 + C, N), x, y, w, h of the center and C scores, input pixels (YOLOv8 and later).
 yolov5: (1, N, 5 + C), x, y, w, h, objectness, C scores, input pixels (YOLOv5, YOLOX decoded).
@@ -6,9 +6,9 @@ yolo-nms: (1, N, 6), left, top, right, bottom, score, class, input pixels (expor
 detr: boxes (1, N, 4) as x, y, w, h, fractions of the input, and logits (1, N, C + 1), the last of
 them "nothing" (DETR). rt-detr: the same with C independent logits (RT-DETR, RF-DETR, DINO).
 
-Three kinds find each fish's mask as well, which no segmenter then looks for:
+Three kinds find each fish's mask as well, so that no segmenter is needed:
 
-yolo-seg: yolo's rows with M more of weights, and M pictures (1, M, h, w) of which they make the
+yolo-seg: yolo's rows with M more weights, and M pictures (1, M, h, w) whose weighted sum is the
 logits of a mask (YOLOv8-seg and later). rf-detr-seg: rt-detr's boxes and logits, and the logits of
 masks (1, N, h, w) (RF-DETR Seg). mask-rcnn: boxes (N, 4) in input pixels, classes (N), scores (N)
 and probabilities (N, 1, height, width) (Mask R-CNN of torchvision). A mask spans the whole input.
@@ -39,7 +39,7 @@ BoxesAndScores = tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N C"]]
 
 
 class OutputShapeError(ValueError):
-    """The outputs are not of the layout; the message says what was expected."""
+    """The outputs are not of the layout; the message contains what was expected."""
 
 
 def decode(
@@ -133,7 +133,7 @@ def _boxes_and_logits(outputs: list[np.ndarray]) -> BoxesAndScores:
     boxes = [i for i, shape in enumerate(shapes) if shape[2] == 4]
     if not boxes:
         raise OutputShapeError("(1, boxes, 4) and (1, boxes, classes)")
-    # Where both have four columns, the boxes are the one with values from 0 to 1.
+    # If both have four columns, the boxes are the output with values from 0 to 1.
     first = min(boxes, key=lambda i: float(np.abs(outputs[i] - 0.5).max(initial=0.0)))
     return _corners(outputs[first][0]), outputs[1 - first][0]
 

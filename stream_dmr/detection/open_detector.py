@@ -45,7 +45,7 @@ class DetectFishSettings(
 def open_detector(settings: DetectFishSettings) -> Detector:
     """The detector of a name, or of a path to an ONNX file or to weights (.pt).
 
-    Torch is imported only for weights. Raises ModelError for an unknown name, and where the file
+    Torch is imported only for weights. Raises ModelError for an unknown name, and if the file
     cannot be used.
     """
     if settings.detector == "motion":

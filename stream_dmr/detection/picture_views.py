@@ -1,4 +1,4 @@
-"""Fish found in a part of a picture, or in a wider one, in the pixels of the picture itself."""
+"""Find fish in parts of a picture and in a wider picture, in the pixels of the picture itself."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,11 +17,11 @@ from stream_dmr.messages import Frame
 _RIM = 0.25  # of the picture's longer side, around it
 _LARGE = 0.4  # of the picture's longer side: fish that are taken from the picture with the rim
 _TILE_SHARE = 0.625  # of the picture's sides: two by two overlap by a quarter of the picture
-_EDGE_PX = 3  # from a tile's edge: what a box there may lack
+_EDGE_PX = 3  # from a tile's edge: a box so near may be cut
 _SURE_NEAR = 0.5  # least score in a tile, where parts of other things look like fish
 _SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
-# Of the longest fish of the picture: what is shorter is dirt, a scale or a leaf beside it, of which
-# nothing but its size says so. See docs/research/real-lengths.md.
+# Share of the longest fish in the picture: shorter finds are dirt, scales or leaves beside it, and
+# only their size shows it. See docs/research/real-lengths.md.
 _SHORTEST = 0.1
 
 
@@ -30,8 +30,9 @@ def find_in_view(
 ) -> Iterator[Candidate]:
     """The candidates in a view, whose corner is at a pixel of the frame, in the frame's pixels."""
     limits = np.tile(np.array(frame.image.shape[1::-1], np.float64), 2)
-    for one in detector.find(replace(frame, image=np.ascontiguousarray(view))):
-        yield replace(one, bbox_xyxy_px=(one.bbox_xyxy_px + np.tile(corner, 2)).clip(0, limits))
+    for candidate in detector.find(replace(frame, image=np.ascontiguousarray(view))):
+        box = (candidate.bbox_xyxy_px + np.tile(corner, 2)).clip(0, limits)
+        yield replace(candidate, bbox_xyxy_px=box)
 
 
 def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
@@ -40,45 +41,45 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     rim_px = round(_RIM * max(height, width))
     afar = cv2.copyMakeBorder(frame.image, rim_px, rim_px, rim_px, rim_px, cv2.BORDER_REPLICATE)
     large = [
-        one
-        for one in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
-        if longer_side(one.bbox_xyxy_px) > _LARGE * max(height, width)
+        candidate
+        for candidate in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
+        if longer_side(candidate.bbox_xyxy_px) > _LARGE * max(height, width)
     ]
     whole, others = [*detector.find(frame)], list[Candidate]()
     rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
     for top, left in product((0, height - rows), (0, width - columns)):
         tile = frame.image[top : top + rows, left : left + columns]
         others += [
-            one
-            for one in find_in_view(detector, frame, tile, (left, top))
-            if one.score >= _SURE_NEAR
-            and not _is_cut(one, frame, tile, (left, top))
-            and not any(_is_part(one, fish) for fish in [*large, *whole])
+            candidate
+            for candidate in find_in_view(detector, frame, tile, (left, top))
+            if candidate.score >= _SURE_NEAR
+            and not _is_cut(candidate, frame, tile, (left, top))
+            and not any(_is_part(candidate, fish) for fish in [*large, *whole])
         ]
     kept = [*large]
-    for one in sorted([*whole, *others], key=lambda one: -one.score):
-        if not any(_are_same(one, fish) for fish in kept):
-            kept.append(one)
-    sure = [longer_side(one.bbox_xyxy_px) for one in kept if one.score >= _SURE_NEAR]
+    for candidate in sorted([*whole, *others], key=lambda candidate: -candidate.score):
+        if not any(_are_same(candidate, fish) for fish in kept):
+            kept.append(candidate)
+    sure = [longer_side(fish.bbox_xyxy_px) for fish in kept if fish.score >= _SURE_NEAR]
     longest_px = max(sure, default=0.0)
-    return [one for one in kept if longer_side(one.bbox_xyxy_px) >= _SHORTEST * longest_px]
+    return [fish for fish in kept if longer_side(fish.bbox_xyxy_px) >= _SHORTEST * longest_px]
 
 
-def _is_part(one: Candidate, fish: Candidate) -> bool:
-    is_inside = fraction_inside(one.bbox_xyxy_px, fish.bbox_xyxy_px) > _INSIDE
-    return is_inside and not _are_same(one, fish)
+def _is_part(candidate: Candidate, fish: Candidate) -> bool:
+    is_inside = fraction_inside(candidate.bbox_xyxy_px, fish.bbox_xyxy_px) > _INSIDE
+    return is_inside and not _are_same(candidate, fish)
 
 
-def _are_same(one: Candidate, fish: Candidate) -> bool:
-    return box_iou(one.bbox_xyxy_px, fish.bbox_xyxy_px) >= _SAME_FISH
+def _are_same(candidate: Candidate, fish: Candidate) -> bool:
+    return box_iou(candidate.bbox_xyxy_px, fish.bbox_xyxy_px) >= _SAME_FISH
 
 
 def _is_cut(
-    one: Candidate, frame: Frame, tile: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
+    candidate: Candidate, frame: Frame, tile: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
 ) -> bool:
     """True if a box reaches an edge of a tile that is none of the picture."""
     low = np.array(corner)
     high = low + tile.shape[1::-1]
-    at_low = (one.bbox_xyxy_px[:2] < low + _EDGE_PX) & (low > 0)
-    at_high = (one.bbox_xyxy_px[2:] > high - _EDGE_PX) & (high < frame.image.shape[1::-1])
+    at_low = (candidate.bbox_xyxy_px[:2] < low + _EDGE_PX) & (low > 0)
+    at_high = (candidate.bbox_xyxy_px[2:] > high - _EDGE_PX) & (high < frame.image.shape[1::-1])
     return bool(at_low.any() or at_high.any())

@@ -1,8 +1,8 @@
-"""Tell from a small grey picture whether anything happens in it.
+"""Detect from a small grey picture whether anything happens in it.
 
-Water moves all the time, more under wind, spray or a camera that sways. What counts as a change is
-therefore measured twice against the scene itself: each cell of the picture against how much that
-cell usually changes, and the largest such change against what it is in most pictures.
+Water moves all the time, more under wind, spray or a camera that sways. A change is therefore
+measured twice against the scene itself: each cell of the picture against the usual change of that
+cell, and the largest such change against the largest change of most pictures.
 """
 
 import cv2
@@ -11,18 +11,18 @@ from jaxtyping import Float32, UInt8
 
 # Chosen on made clips of water, the shared scenes and real clips; see docs/research/raw-video.md.
 _LONGER_PX = 160  # of the small picture, whose pixels are the cells
-_MEAN_RATE, _CHANGE_RATE = 0.1, 0.05  # of learning a cell's brightness, and how much it changes
+_MEAN_RATE, _CHANGE_RATE = 0.1, 0.05  # of learning a cell's brightness, and its usual change
 _LEAST_CHANGE = 2.0  # grey levels; of cells that never change
-_LIGHT_CELLS = 41  # over which a change is one of light
+_LIGHT_CELLS = 41  # a change over so many cells is a change of light
 _FISH_CELLS = 3  # of the smallest fish: that many cells change together
 _RATIO = 1.2  # of the largest change to the usual one, from which on something happens
-# Of the usual one's way up and down, a picture: in the balance it is exceeded by two in three.
+# Factors of the usual change, up and down, a picture: in balance two pictures in three exceed it.
 _UP, _DOWN = 1 + 0.01 * 2 / 3, 1 - 0.01 * 4 / 3
-_FIRST_PICTURES = 30  # all are looked at, until it is known what is usual
+_FIRST_PICTURES = 30  # all are examined, until the usual change is known
 
 
 class StillWater:
-    """Keeps what usually changes in the pictures of a source."""
+    """Keeps the usual change of the pictures of a source."""
 
     def __init__(self) -> None:
         self._mean: Float32[np.ndarray, "h w"] | None = None  # of each cell, grey levels
@@ -32,13 +32,13 @@ class StillWater:
 
     @property
     def is_new(self) -> bool:
-        """True until it is known what is usual."""
+        """True until the usual change is known."""
         return self._num <= _FIRST_PICTURES
 
     def changes(self, image: UInt8[np.ndarray, "H W 3"], *, is_empty: bool) -> bool:
         """True if something happens in the next picture (BGR).
 
-        `is_empty`: nothing is followed in it, so that it may be told from it what is usual.
+        `is_empty`: nothing is followed in it, so that the usual change may be learnt from it.
         """
         small = _small_grey(image)
         self._num += 1
