@@ -84,7 +84,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> object:
-    """Import what is asked for when it is asked for (PEP 562): the import alone stays cheap."""
+    """Import a name when it is first used (PEP 562), so that importing the package stays cheap."""
     if name not in _MODULES:
         raise AttributeError(f"module 'stream_dmr' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"stream_dmr.{_MODULES[name]}"), name)

@@ -39,24 +39,24 @@ class Run:
     out: Path
 
     def __init__(self, out: Location) -> None:
-        """Opens the folder; what is missing in it raises where it is asked for."""
+        """Open the folder; missing files raise when they are used."""
         object.__setattr__(self, "out", Path(out))
 
     @cached_property
     def fish(self) -> list[FishRow]:
-        """Every finished fish, as in lengths.csv. UserError where that can't be read."""
+        """Every finished fish, as in lengths.csv. UserError if that can't be read."""
         return read_rows(self.out / "lengths.csv", FishRow)
 
     @cached_property
     def frames(self) -> list[FrameRow]:
-        """Every fish in every frame, as in frames.csv. UserError where that can't be read."""
+        """Every fish in every frame, as in frames.csv. UserError if that can't be read."""
         path = self.out / "frames.csv"
         return [row for table in (*rotated_files(path), path) for row in read_rows(table, FrameRow)]
 
     def messages(
         self, kinds: Collection[type[Message]] | None = None, *, tracks: Collection[int] = ()
     ) -> Iterator[Message]:
-        """The recorded messages, as `open` gives them."""
+        """The recorded messages, as from `open`."""
         return iter(open(self.out, kinds, tracks=tracks))
 
 
@@ -72,14 +72,14 @@ class RecordedRun:
     config_toml: str  # every setting of the run
 
     def __iter__(self) -> Iterator[Message]:
-        """The messages in the order in which they were written: each kind in that of its frames.
+        """The messages in the order in which they were written; each kind by its frames.
 
         Stages run side by side, so a Frame may come before the LocalizedFish of the frame before;
-        a fish's final length comes when its track has ended. To have one frame's messages together
+        a fish's final length comes when its track has ended. To get one frame's messages together
         collect them by `frame_index`, or open one kind at a time.
 
-        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
-        recording is damaged; what a crash cut off is logged as a warning, and the rest read.
+        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError if the
+        recording is damaged; an end cut off by a crash is logged as a warning, and the rest read.
         """
         recording = open_recordings(self.paths)
         for message, _ in decoded_messages(recording, self.kinds, self.selection):
@@ -115,7 +115,7 @@ def measure(
     `out` is runs/ and the source's name by default. Without `calibration` there are shapes and
     pixels, no millimetres. Setting `stop` ends the run early, with what was measured so far.
     Warnings are logged (logger "stream_dmr"), or passed to `observer`. Raises a UserError, in one
-    line, where an input is wrong.
+    line, if an input is wrong.
     """
     request = options_of(RunOptions, locals())
     measure_source(
@@ -143,9 +143,9 @@ def replay(
 ) -> Run:
     """Recompute a recording from the stage `first` on, as `stream-dmr replay` does.
 
-    `recordings`: files, folders of runs or of segments, in order. What is None is as it was
-    recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError
-    where an input is wrong.
+    `recordings`: files, folders of runs or of segments, in order. Arguments that are None keep the
+    recorded value; `tracks` and `time_s` (from, to, capture time) select a part of it. Raises a
+    UserError if an input is wrong.
     """
     parts = {"recordings": _paths(recordings), "selection": _selection(time_s, tracks)}
     request = options_of(ReplayOptions, locals() | parts)
@@ -165,8 +165,8 @@ def open(
     """Open a recording (.mcap, .rrd), the folder of a run, or several in order, for iteration.
 
     `kinds`: only these messages, such as [LengthEstimate]; `tracks`, `time_s`: only these fish and
-    this capture time (from, to). RecordingError where it can't be read, another UserError where
-    the time is none.
+    this capture time (from, to). RecordingError if it can't be read, another UserError if the time
+    is invalid.
     """
     selection = _selection(time_s, tracks)
     paths = _paths(recordings)

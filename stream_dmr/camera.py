@@ -108,7 +108,7 @@ class Camera:
         return Camera(width=size, height=size, K=K, distortion=np.zeros(5))
 
     def resized(self, size: int) -> "Camera":
-        """The square crop of this camera in `size` x `size` pixels, whose edges stay in place."""
+        """The square crop of this camera in `size` x `size` pixels, with its edges in place."""
         scale = size / self.width
         K = self.K.copy()
         K[:2, :2] *= scale
@@ -121,7 +121,7 @@ class Camera:
 
     @classmethod
     def nominal(cls, *, width: int, height: int) -> "Camera":
-        """A stand-in where nothing is calibrated: some 45 degrees wide, no distortion.
+        """A stand-in for a camera without calibration: some 45 degrees wide, no distortion.
 
         Good enough for relative shapes; never for millimetres.
         """
@@ -155,12 +155,12 @@ class ReferencePlane:
 
     @property
     def distance_mm(self) -> float:
-        """From the camera, at a right angle to the plane."""
+        """Distance from the camera, at a right angle to the plane."""
         return float(abs(self.rotation[:, 2] @ self.translation_mm))
 
     @property
     def lean_rad(self) -> float:
-        """Angle between the plane and one that faces the camera, 0 to pi / 2."""
+        """Angle between the plane and a plane that faces the camera, 0 to pi / 2."""
         return float(np.arccos(min(abs(self.rotation[2, 2]), 1.0)))
 
     def homography(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

@@ -23,9 +23,9 @@ R = TypeVar("R")
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a kernel: loops over float64 numpy arrays, and over tuples of them.
 
-    Its annotations are for readers and type checkers. Where tests check them at run time, the
-    function comes wrapped, which can't be compiled, and is unwrapped first; they are checked where
-    nothing is compiled, under NUMBA_DISABLE_JIT=1.
+    Its annotations are for readers and type checkers. If tests check them at run time, the function
+    comes wrapped, which can't be compiled, and is unwrapped first; they are checked without
+    compilation, under NUMBA_DISABLE_JIT=1.
     """
     if not is_compiling():
         return function
@@ -40,8 +40,8 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """As `compiled`, but as a part of the kernel that calls it.
 
-    LLVM works through a kernel with all that it calls, so that the innermost loops are compiled
-    once more at each level. This is for large kernels with one caller, at one place.
+    LLVM compiles a kernel with all that it calls, so that the innermost loops are compiled again at
+    each level. This is for large kernels with one caller, in one place.
     """
     if not is_compiling():
         return function
@@ -54,7 +54,7 @@ def is_compiling() -> bool:
 
 
 def cache_folder() -> Path:
-    """Where compiled functions are kept: NUMBA_CACHE_DIR, or a folder of this version's own."""
+    """The folder of compiled functions: NUMBA_CACHE_DIR, or a folder of this version's own."""
     users_own = getattr(config, "CACHE_DIR", "")
     return Path(users_own) if users_own else _cache_folder()
 
@@ -76,10 +76,10 @@ def _cache_folder() -> Path:
 
 
 def users_cache(name: str, *, installed: Path) -> Path:
-    """The folder `name` in this user's cache, filled from the one that an installation filled.
+    """The folder `name` in this user's cache, filled from the installation's folder.
 
-    What lies there is executed, so it is refused where others own it or may write to it; functions
-    are then compiled for this process alone, into a folder that nobody could know before.
+    Its files are executed, so it is refused if others own it or may write to it; functions are then
+    compiled for this process alone, into a folder whose name nobody could know before.
     """
     cache = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # of a systemd service
     base = Path(cache) if cache else _users_cache_base() / "stream-dmr"
@@ -103,7 +103,7 @@ def users_cache(name: str, *, installed: Path) -> Path:
 
 
 def _users_cache_base() -> Path:
-    """$XDG_CACHE_HOME, or ~/.cache, as the XDG Base Directory Specification says."""
+    """$XDG_CACHE_HOME, or ~/.cache, after the XDG Base Directory Specification."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     return Path(given) if Path(given).is_absolute() else Path.home() / ".cache"
 
@@ -120,7 +120,7 @@ def _require_private(folder: Path) -> None:
 
 
 def _fill(folder: Path, installed: Path) -> None:
-    """Make a folder, with copies of the installation's compiled functions where there are any."""
+    """Make a folder, with copies of the installation's compiled functions if there are any."""
     draft = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
     try:
         if installed.is_dir():

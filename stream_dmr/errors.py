@@ -1,18 +1,18 @@
-"""Errors of the user's input; each message says what was expected, what came, and what to do."""
+"""Errors of the user's input; each message has the expected, the received, and what to do."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
 
 
 def reason_of(error: Exception) -> str:
-    """What went wrong, without number and file name where the system says it."""
+    """The message of an error, without the number and file name of system errors."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 class UserError(Exception):
     """The user's input is wrong: the command prints this one line and exits with 2.
 
-    The message says what was expected, what came instead, and what to do.
+    The message has the expected and the received value, and what to do.
     """
 
 
@@ -50,7 +50,7 @@ class RecordingError(UserError):
 
 @contextmanager
 def requires_extra(extra: str, what: str) -> Generator[None]:
-    """Turn a package that an import of the block lacks into a UserError that says how to get it.
+    """Turn the ImportError of a missing package into a UserError with how to install it.
 
     `extra`: of pyproject.toml, or "torch".
     """

@@ -17,7 +17,7 @@ from typing import Any
 
 from stream_dmr.errors import ConfigError, OutputError, reason_of
 
-MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibration take
+MAX_TEXT_BYTES = 1_000_000  # chosen: many times the size of any settings or calibration
 
 
 class TransactionalFile:
@@ -39,7 +39,7 @@ class TransactionalFile:
     def write(self, data: bytes) -> int:
         """Append `data`, returning its size. Raises OSError, with the file cut back to before.
 
-        Where even the cutting fails, the next write tries it first.
+        If even the cutting fails, the next write tries it first.
         """
         rest = memoryview(data)
         try:
@@ -90,13 +90,13 @@ def _is_open_at(descriptor: int, path: Path) -> bool:
 
 
 class Snapshot:
-    """A file as it is now: what is appended later is not seen, and it may be renamed or deleted.
+    """A file as it is now: later appended bytes are not seen, and it may be renamed or deleted.
 
-    It is held open for as long as this object, or one of its streams, is in use.
+    It is held open as long as this object, or one of its streams, is in use.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises OSError where it can't be read."""
+        """Raises OSError if it can't be read."""
         self.descriptor = os.open(path, os.O_RDONLY)
         self.size = os.fstat(self.descriptor).st_size
         weakref.finalize(self, os.close, self.descriptor)
@@ -137,8 +137,8 @@ class _SnapshotStream(io.RawIOBase):
 def open_file(path: Path) -> Generator[io.BufferedReader]:
     """Open a file that others wrote, to be read.
 
-    Raises OSError, also for a pipe or a device: reading it may never begin, or never end. What is
-    checked is what was opened: another file may have the name a moment later.
+    Raises OSError, also for a pipe or a device: reading it may never begin, or never end. The
+    opened file is checked, not its name, which another file may have a moment later.
     """
     with open(path, "rb", opener=_open_at_once) as file:  # which refuses a folder
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -151,15 +151,15 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file that people write, such as settings; devices don't end.
+    """The text of a file that people write, such as settings.
 
-    Raises OSError where it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
+    Raises OSError if it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
     """
     return read_small(path, max_bytes=max_bytes).decode(encoding)
 
 
 def read_secret(path: Path, *, where: str, what: str = "the access token") -> str:
-    """`what` a file holds alone. Raises ConfigError about the option or key `where`."""
+    """Read `what`, the only content of a file. ConfigError about the option or key `where`."""
     try:
         return read_text(path).strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -237,8 +237,8 @@ def writing_to(path: Path) -> Generator[None]:
 def replacing(path: Path) -> Generator[Path]:
     """A draft to write to, which replaces `path` after the block; an error leaves nothing of it.
 
-    At any moment the old or the new file is complete. The draft is this process's alone; those of
-    killed processes are removed. Raises OutputError where the disk refuses it.
+    At any moment the old or the new file is complete. The draft is this process's alone; drafts of
+    killed processes are removed. Raises OutputError if the disk refuses it.
     """
     draft = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -284,7 +284,7 @@ class FolderLock:
     """Holds a folder for this process until `release`; a crash releases it as well."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises OutputError where another process holds the folder."""
+        """Raises OutputError if another process holds the folder."""
         self._folder = folder
         self._descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -302,7 +302,7 @@ class FolderLock:
 
     @property
     def is_in_place(self) -> bool:
-        """False where the folder was renamed, deleted or replaced since."""
+        """False if the folder was renamed, deleted or replaced since."""
         return _is_open_at(self._descriptor, self._folder)
 
     def release(self) -> None:
@@ -313,7 +313,7 @@ class FolderLock:
 
 
 def require_unlocked(folder: Path) -> None:
-    """Raise OutputError where another run is writing to the folder."""
+    """Raise OutputError if another run is writing to the folder."""
     FolderLock(folder).release()
 
 
@@ -329,7 +329,7 @@ class ReservedSpace:
         self._path = folder / _NAME
 
     def reserve(self) -> None:
-        """Reserve the space; where the disk refuses it, none is reserved."""
+        """Reserve the space; if the disk refuses it, none is reserved."""
         with suppress(OSError):
             disk = os.statvfs(self._path.parent)
             size = min(_MAX_BYTES, int(_MAX_SHARE * disk.f_bavail * disk.f_frsize))

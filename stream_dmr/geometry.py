@@ -16,9 +16,9 @@ def arc_length(points: Float[np.ndarray, "M D"]) -> float:
 
 
 def bending_ratio(midline: Float[np.ndarray, "M 3"]) -> float:
-    """Arc over chord of a midline (eq. 13): 1 for a straight fish, larger for a bent one.
+    """Arc over chord of a midline (eq. 13): 1 for a straight fish, larger for a bent fish.
 
-    Raises ValueError where both ends coincide, since the ratio has no value there.
+    Raises ValueError if both ends coincide, since the ratio has no value then.
     """
     chord = float(np.linalg.norm(midline[-1] - midline[0]))
     if chord == 0.0:
@@ -36,10 +36,10 @@ def transformed(
 def components(
     mask: UInt8[np.ndarray, "H W"],
 ) -> tuple[int, Int32[np.ndarray, "H W"], Int32[np.ndarray, "N 5"]]:
-    """How many there are with the background, 0; labels; x, y, width, height and area of each, px.
+    """Number with the background, 0; labels; x, y, width, height and area of each, px.
 
-    The labels are those of `cv2.connectedComponentsWithStats`, which takes another algorithm by
-    default, made for several threads and slow on one.
+    The labels are those of `cv2.connectedComponentsWithStats`, whose default algorithm is made for
+    several threads and slow on a single one.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
         mask, 8, cv2.CV_32S, cv2.CCL_BBDT
@@ -63,7 +63,7 @@ def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) 
     return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
 
 
-def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+def box_iou(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    sides = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
     both = np.prod(np.maximum(sides, 0))
-    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))
+    return float(both / (np.prod(box[2:] - box[:2]) + np.prod(other[2:] - other[:2]) - both))

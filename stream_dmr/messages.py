@@ -3,8 +3,8 @@
 Frame -> FishCrop -> FittedMesh -> LocalizedFish -> LengthEstimate
 
 `slots` and `eq=False`: a generated `==` fails on arrays. Arrays are made read-only on the way in.
-A fish that a stage can't handle is not dropped: its message carries the reason, and the stages
-after it pass that reason on.
+A fish that a stage can't handle is not dropped: its message contains the reason, and later stages
+pass that reason on.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ class _ReadOnly:
 
 @cache
 def _field_names(kind: type) -> frozenset[str]:
-    """Of a message's dataclass: finding out takes longer than all else that is done with them."""
+    """Field names of a message class, cached because `dataclasses.fields` is slow."""
     return frozenset(part.name for part in fields(kind))
 
 
@@ -54,7 +54,7 @@ class Frame(_ReadOnly):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FishMessage(_ReadOnly):
-    """What each message of one fish in one frame begins with."""
+    """The first fields of each message of one fish in one frame."""
 
     frame_index: int
     timestamp_ns: int  # capture time
@@ -66,20 +66,20 @@ class CropQuality:
     """Facts about a crop that later stages gate by."""
 
     touches_border: bool  # the mask reaches the edge of the frame or crop: part of it is outside
-    visible_fraction: float  # of the fish, 0 to 1, as the annotations or the tracker say
+    visible_fraction: float  # of the fish, 0 to 1, by the annotations or the tracker
     sharpness: float  # variance of the Laplacian inside the mask, grey levels squared
     mask_area_px: float  # of the mask, in frame pixels
-    # The IoU with the truth that nine in ten masks like this one reach; None: given, not found
+    # The IoU with the truth that nine in ten masks of this confidence reach; None: a given mask
     mask_confidence: float | None = None
     glare: float | None = None  # share of the mask that is blown out; None: an older recording
-    # How much longer or shorter the fish was in a box that goes on beyond its ends, over its
-    # length; None: nobody looked.
+    # Change of the fish's length in a box that extends beyond its ends, over its length; None: not
+    # looked at.
     length_doubt: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FishEnds(_ReadOnly):
-    """Where a segmenter sees the snout and the fork of the tail, and its confidence."""
+    """Snout and fork of the tail by a segmenter, and its confidence."""
 
     head_px: Float[np.ndarray, "2"]  # crop pixels
     tail_px: Float[np.ndarray, "2"]
@@ -88,18 +88,18 @@ class FishEnds(_ReadOnly):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FishCrop(FishMessage):
-    """One fish cut out of one frame, through an ideal pinhole camera of its own."""
+    """One fish cut out of a frame, through an ideal pinhole camera of its own."""
 
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
     image: UInt8[np.ndarray, "S S 3"] | None  # BGR, lens distortion removed; None: not recorded
-    mask: Bool[np.ndarray, "S S"]  # all False where nothing was segmented
+    mask: Bool[np.ndarray, "S S"]  # all False if nothing was segmented
     crop_camera: Camera  # of `image` and `mask`; the orientation is the frame camera's
-    frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
+    frame_camera: Camera  # with crop_camera it determines the exact crop-to-frame pixel map
     quality: CropQuality
-    ends: FishEnds | None = None  # None where the segmenter does not find them
-    # What something in front of the fish may hide, neither fish nor water; None: nothing.
+    ends: FishEnds | None = None  # None if the segmenter does not find them
+    # Pixels that an object in front of the fish may hide, neither fish nor water; None: no pixel.
     unknown: Bool[np.ndarray, "S S"] | None = None
-    # Probability of each species by FAO code; empty where no classifier looked.
+    # Probability of each species by FAO code; empty without a classifier.
     species: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
@@ -137,7 +137,7 @@ class FittedShape(_ReadOnly):
     """
 
     parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.body
-    vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, `parameters` give them
+    vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, computed from `parameters`
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels
     midline: Float[np.ndarray, "M 3"]  # head keypoint to tail keypoint
@@ -157,10 +157,10 @@ class FittedShape(_ReadOnly):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FittedMesh(FishMessage):
-    """The fit of one crop, or why there is none."""
+    """The fit of one crop, or the reason why there is none."""
 
-    shape: FittedShape | None  # None where `refusal` says why
-    report: SolverReport | None  # None where no solver ran
+    shape: FittedShape | None  # None if there is a `refusal`
+    report: SolverReport | None  # None if no solver ran
     quality: CropQuality
     refusal: str  # "" when fitted, else a Reason
     species: Mapping[str, float] = field(default_factory=dict[str, float])  # FishCrop's
@@ -190,7 +190,7 @@ class LocalizedFish(FishMessage):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TrackEnded(FishMessage):
-    """A fish that no later frame shows; frame and time are those after which it ended."""
+    """A fish that no later frame shows; frame and time are the last before its end."""
 
     # "lost": the tracker dropped it; "timeout": unseen for `track_timeout_s`; "end": of the source;
     # "restart": in view when an earlier run broke off; "pause": in view when no further clip came.
@@ -209,7 +209,7 @@ class TrackEnded(FishMessage):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class LengthEstimate(FishMessage):
-    """What is known of one fish's length so far; `is_final` once its track has ended.
+    """The length of one fish by its frames so far; `is_final` once its track has ended.
 
     Frame and time are those of the LocalizedFish that it follows.
     """
@@ -231,7 +231,7 @@ class LengthEstimate(FishMessage):
     smoothed_frames: Int[np.ndarray, "N"]  # frame indices of the RTS series, empty until final
     smoothed_mm: Float[np.ndarray, "N"]
     smoothed_std_mm: Float[np.ndarray, "N"]
-    # What became of the fish; None until final, and where the run has no zones that say so.
+    # What became of the fish; None until final, and if the run has no zones for it.
     fate: str | None = None
     fate_share: float | None = None  # of its body in that zone; None: its end was not seen
     # FAO 3-alpha of the species, or "unsure"; None until final, and without a classifier's look.
@@ -241,7 +241,7 @@ class LengthEstimate(FishMessage):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Position(_ReadOnly):
-    """Where the vessel was, as its receiver said; degrees of WGS 84."""
+    """Place of the vessel by its receiver; degrees of WGS 84."""
 
     frame_index: int  # of the frame before it; 0: it came before the first
     timestamp_ns: int  # on the clock of the frames; before a video's start it is negative
@@ -254,14 +254,14 @@ class Position(_ReadOnly):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class LearntShapes(_ReadOnly):
-    """Mean shapes of the fish of a camera: those that it sees first from here on may have them."""
+    """Mean shapes of the fish of a camera; fish first seen from here on may have them."""
 
     frame_index: int
     timestamp_ns: int
     names: str  # of the body form that each is like, joined by commas
     coefficients: Float[np.ndarray, "N W"]  # see fitting/shape/space.py
     covariances: Float[np.ndarray, "N W W"]
-    shares: Float[np.ndarray, "N"]  # of the fish; what is left of 1 is for the body forms
+    shares: Float[np.ndarray, "N"]  # of the fish; the body forms have the rest of 1
 
 
 Message = (

@@ -1,4 +1,4 @@
-"""Pictures from files: which files are some, those that are too large, and those cut off."""
+"""Read pictures from files; recognise files that are no pictures, too large, or cut off."""
 
 import re
 import warnings
@@ -67,10 +67,10 @@ def read_picture(path: Path, flags: int) -> np.ndarray | None:
 
 
 def is_cut_off(content: bytes) -> bool:
-    """True for a JPEG that ends before its end marker, whose rest OpenCV would fill with grey.
+    """True for a JPEG that ends before its end marker; OpenCV would fill the rest with grey.
 
-    Its segments are walked, since a thumbnail in one has an end marker of its own. Of other kinds
-    of pictures OpenCV refuses what is cut off.
+    Its segments are walked, since a thumbnail in a segment has an end marker of its own. OpenCV
+    itself refuses pictures of other kinds that are cut off.
     """
     if not content.startswith(_JPEG_START):
         return False

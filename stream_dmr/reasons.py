@@ -11,16 +11,16 @@ _PLACE = "A frame that can't be localized"
 _FRAME = "A frame that is refused"
 _FISH = "A fish that has no length"
 
-# What else a fish's status can be: it has a length, or its track has not ended yet.
+# Other values of a fish's status: it has a length, or its track has not ended yet.
 MEASURED, MEASURING = "measured", "measuring"
 
 
 class Reason(StrEnum):
-    """Why something was refused; equal to its text."""
+    """A reason for a refusal; equal to its text."""
 
-    subject: str  # what is refused
+    subject: str  # the refused thing, as the start of a sentence
     explanation: str
-    remedy: str  # what a user can do
+    remedy: str  # advice for users
 
     def __new__(cls, text: str, subject: str, explanation: str, remedy: str) -> "Reason":
         reason = str.__new__(cls, text)

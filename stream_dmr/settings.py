@@ -4,7 +4,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Settings(BaseModel):
-    """Base class of one table of `config.toml`, defined beside the algorithm that uses it.
+    """Base class of a table of `config.toml`, defined beside the algorithm that uses it.
 
     Unknown keys, wrong types and values out of range raise pydantic's ValidationError, which
     `pipeline.config` turns into a ConfigError of one line.

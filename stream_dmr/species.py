@@ -1,11 +1,9 @@
 """Species that fisheries land, and the evidence of frames for the species of a fish.
 
-The species that reviewers choose from, and that codes stand for.
-
 `species.csv` has 101 species that fisheries with hooks land, with codes and names from the ASFIS
-List of Species for Fishery Statistics Purposes (FAO, 2022), and the bundled body form that each is
-near to; where a source could be read, also AphiaID (ICES' code lists), equations between lengths,
-and the largest known one. A user's own file adds others, or replaces them.
+List of Species for Fishery Statistics Purposes (FAO, 2022), and the nearest bundled body form; if a
+source could be read, also AphiaID (ICES' code lists), equations between lengths, and the largest
+known length. A user's own file adds species, or replaces them.
 """
 
 import csv
@@ -50,7 +48,7 @@ _COLUMNS = [field.name for field in fields(Species)]
 
 def load_species(own: str = "") -> list[Species]:
     """The bundled species and those of the CSV file `own`, by code. Raises ConfigError."""
-    known = {one.code: one for one in _bundled()}
+    known = {species.code: species for species in _bundled()}
     if own:
         try:
             text = read_text(Path(own))
@@ -58,17 +56,17 @@ def load_species(own: str = "") -> list[Species]:
             raise ConfigError(
                 f"[species] own_list: expected a CSV with {_EXPECTED}, {own}: {reason_of(error)}"
             ) from error
-        known |= {one.code: one for one in _parse(text, where=own)}
+        known |= {species.code: species for species in _parse(text, where=own)}
     return [known[code] for code in sorted(known)]
 
 
 def find_species(text: str, species: Sequence[Species]) -> Species | None:
-    """The species whose code or name is this text, whatever its capitals; None: there is none."""
-    return next((one for one in species if is_called(one, text)), None)
+    """The species whose code or name is this text, in any capitals; None if there is none."""
+    return next((known for known in species if is_called(known, text)), None)
 
 
 def is_called(species: Species, text: str) -> bool:
-    """True where a text is the code or one of the names of a species, whatever its capitals."""
+    """True if a text is the code or a name of a species, in any capitals."""
     wanted = text.strip().casefold()
     names = (species.code, species.scientific_name, species.english_name)
     return wanted in [name.casefold() for name in names]
@@ -103,9 +101,9 @@ def _parse(text: str, *, where: str) -> list[Species]:
 def converted_length(
     species: Species, length_mm: float, *, given: str, wanted: str
 ) -> tuple[float, str] | None:
-    """Another of the species' lengths by its own equation, or by that solved for it; its source.
+    """Another of the species' lengths by an equation, or by an equation solved for it; its source.
 
-    None where there is no equation of these two: two in sequence would add their errors.
+    None if there is no equation of these two: two in sequence would add their errors.
     """
     for length, factor, other, sign, offset_cm, source in _EQUATION.findall(species.lengths):
         offset_mm = 10 * float(sign + offset_cm)
@@ -120,9 +118,9 @@ def converted_length(
 
 
 def is_longer_than_known(code: str, low_mm: float, *, given: str | None) -> bool:
-    """True where even `low_mm` is above the largest known length of a species of the bundled list.
+    """True if even `low_mm` is above the largest known length of a bundled species.
 
-    No length from the snout is above the total one; others are compared with their own kind only.
+    No length from the snout exceeds the total length; others are compared with their own kind only.
     """
     largest_mm, kind = _largest_length(code)
     return low_mm > largest_mm and kind in ("total", given) and given != "disc width"
@@ -130,7 +128,7 @@ def is_longer_than_known(code: str, low_mm: float, *, given: str | None) -> bool
 
 @cache  # each frame asks
 def _largest_length(code: str) -> tuple[float, str]:
-    """Of a bundled species, mm, and which of its lengths that is; infinity where none is known."""
+    """The largest length of a bundled species, mm, and its kind; infinity if none is known."""
     species = find_species(code, _bundled())
     match = _LARGEST.fullmatch(species.largest) if species else None
     return (math.inf, "") if match is None else (10 * float(match[1]), match[2])
@@ -175,7 +173,7 @@ class SpeciesSettings(Settings):
 
 
 UNSURE = "unsure"
-_LEAST = 1e-3  # what one frame says against a species is never more: it may show a hand. Chosen.
+_LEAST = 1e-3  # least probability of a species in a frame, which may show a hand. Chosen.
 
 
 class SpeciesFound(NamedTuple):
@@ -188,7 +186,7 @@ class SpeciesFound(NamedTuple):
 class SpeciesEvidence:
     """Takes the frames of one fish.
 
-    Of n frames with probabilities p_t, the posterior of species s is
+    With n frames of probabilities p_t, the posterior of species s is
 
         p(s) = exp(m mean_t log p_t(s)) / sum,    m = n / (1 + (n - 1) r)
 
@@ -203,7 +201,7 @@ class SpeciesEvidence:
         self._num_frames = 0
 
     def add(self, probabilities: Mapping[str, float]) -> None:
-        """Take one frame; nothing where no classifier looked at it."""
+        """Take one frame; ignored if no classifier looked at it."""
         if not probabilities:
             return
         self._num_frames += 1
@@ -211,7 +209,7 @@ class SpeciesEvidence:
             self._sums[code] = self._sums.get(code, 0.0) + math.log(max(probability, _LEAST))
 
     def posterior(self) -> dict[str, float]:
-        """The probability of each species; empty where no frame says anything."""
+        """The probability of each species; empty without any evidence."""
         if not self._num_frames:
             return {}
         worth = self._num_frames / (1 + (self._num_frames - 1) * self._correlation)
@@ -222,17 +220,17 @@ class SpeciesEvidence:
         return {code: weight / total for code, weight in weights.items()}
 
     def best(self) -> SpeciesFound | None:
-        """The likeliest species; None where no frame says anything."""
+        """The likeliest species; None without any evidence."""
         posterior = self.posterior()
         if not posterior:
             return None
-        code = max(posterior, key=lambda one: posterior[one])
+        code = max(posterior, key=lambda code: posterior[code])
         return SpeciesFound(code, posterior[code])
 
 
 def forms_of_species(settings: SpeciesSettings) -> dict[str, str]:
     """The body form that each species is near to, by code. Raises ConfigError."""
-    forms = {one.code: one.form for one in load_species(settings.own_list) if one.form}
+    forms = {known.code: known.form for known in load_species(settings.own_list) if known.form}
     for pair in settings.forms:
         code, _, form = pair.partition("=")
         forms[code.strip()] = form.strip()

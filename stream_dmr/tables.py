@@ -28,11 +28,11 @@ class CsvFile:
         max_bytes: int | None = None,
         on_renamed: Callable[[Path], None] = lambda path: None,
     ) -> None:
-        """Open `path` for writing; raises OutputError where the disk refuses it.
+        """Open `path` for writing; raises OutputError if the disk refuses it.
 
-        `resume`: complete rows that are in the file stay. `retry_open`: where the file can't be
-        opened now, it is opened with a later row instead of raising. `max_bytes`: a file that has
-        grown to this size is renamed (see `rotated_files`), which `on_renamed` gets, and a new one
+        `resume`: complete rows that are in the file stay. `retry_open`: if the file can't be opened
+        now, it is opened with a later row instead of raising. `max_bytes`: a file that has grown to
+        this size is renamed (see `rotated_files`), `on_renamed` gets its new name, and another file
         begins.
         """
         self._path, self._columns, self._max_bytes = path, columns, max_bytes
@@ -45,7 +45,7 @@ class CsvFile:
                 raise self._refusal(error) from error
 
     def add(self, row: list[str]) -> None:
-        """Append a row. Raises OutputError where the disk refuses it; nothing of it stays then."""
+        """Append a row. Raises OutputError if the disk refuses it; then nothing of it stays."""
         try:
             file = self._file or self._open(resume=True)
             self.require_name()
@@ -56,7 +56,7 @@ class CsvFile:
             raise self._refusal(error) from error
 
     def require_name(self) -> None:
-        """Raise OutputError where the file that is open was renamed, deleted or replaced."""
+        """Raise OutputError if the open file was renamed, deleted or replaced."""
         if self._file is not None and not self._file.is_at(self._path):
             raise self._refusal(OSError(errno.ESTALE, "another file or none has its name now"))
 
@@ -103,7 +103,7 @@ def rotated_files(path: Path) -> list[Path]:
 
 
 def _last_rotation(path: Path) -> int:
-    """The highest number of a rotated file; 0 where there is none."""
+    """The highest number of a rotated file; 0 if there is none."""
     names = (rotated.stem.rpartition("-")[2] for rotated in rotated_files(path))
     return max((int(name) for name in names if name.isdecimal()), default=0)
 
@@ -208,13 +208,13 @@ Row = TypeVar("Row")
 def read_rows(path: Path, row: type[Row]) -> list[Row]:
     """All rows of a table; columns that `row` does not have are left out.
 
-    UserError where the file can't be read, or a column or a value is not what it should be.
+    UserError if the file can't be read, or if a column or a value is invalid.
     """
     return [row(**values) for values in read_records(path, row)]
 
 
 def read_records(path: Path, row: type) -> list[dict[str, Any]]:
-    """As `read_rows`, with the values of each row by their names."""
+    """Read like `read_rows`, but each row as a dictionary by column names."""
     kinds = get_type_hints(row)
     try:
         with path.open(newline="", encoding="utf-8") as file:
