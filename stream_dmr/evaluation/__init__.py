@@ -1,1 +1,1 @@
-"""Compare measured lengths with known ones."""
+"""Compare measured lengths with known lengths."""

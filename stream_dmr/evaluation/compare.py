@@ -1,4 +1,4 @@
-"""`stream-dmr evaluate`: measured lengths against true ones, by fish and as distributions.
+"""`stream-dmr evaluate`: measured against true lengths, by fish and as distributions.
 
 Fish are paired by track_id; the two distributions are compared without pairing, as in the paper.
 """
@@ -33,7 +33,7 @@ from stream_dmr.evaluation.length_tables import (
 
 @dataclass(frozen=True, kw_only=True)
 class FishComparison:
-    """One fish: its true length and what was measured."""
+    """The true and the measured length of one fish."""
 
     track_id: int
     truth_mm: float
@@ -84,8 +84,8 @@ def evaluate(
 ) -> Evaluation:
     """Compare two CSV files fish by fish.
 
-    Raises UserError where one can't be read, or where they have no track_id in common: then
-    nothing says which fish are the same.
+    Raises UserError if one can't be read, or if they have no track_id in common, by which fish are
+    paired.
     """
     lengths, truth = read_lengths(lengths_csv), read_truth(truth_csv)
     if lengths and not lengths.keys() & truth.keys():
@@ -107,7 +107,7 @@ def evaluate_histogram(
     """Compare lengths with a histogram, in its own bins.
 
     Only the pseudo count of the settings is used. A histogram of shares is scaled to the number of
-    measured fish. Raises UserError where a file can't be read or no fish lies in the bins.
+    measured fish. Raises UserError if a file can't be read or no fish lies in the bins.
     """
     known = read_histogram(histogram_csv)
     lengths_mm = _measured_mm(read_lengths(lengths_csv))
@@ -124,7 +124,7 @@ def evaluate_histogram(
 def compare(
     lengths: Mapping[int, LengthRow], truth: Mapping[int, float], *, settings: EvaluateSettings
 ) -> Evaluation:
-    """Compare measured with true lengths (mm), both by track_id; at least one true one."""
+    """Compare measured with true lengths (mm), both by track_id; at least one true length."""
     nothing = LengthRow(length_mm=None)
     fish = tuple(
         FishComparison(
@@ -251,7 +251,7 @@ def _interval_rows(i: IntervalFigures) -> list[tuple[str, str]]:
 def plot_histograms(path: Path, distributions: Distributions) -> None:
     """Draw both histograms into a picture; the suffix of `path` is its format, PNG without one.
 
-    Raises OutputError where it can't be written.
+    Raises OutputError if it can't be written.
     """
     with requires_extra("plots", "a plot of the lengths"):
         from matplotlib.figure import Figure  # its import takes a quarter of a second
@@ -269,7 +269,7 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
     )
     axes.legend(frameon=False)
     try:
-        # By which `evaluate` knows its own pictures; other formats have other names for it.
+        # A mark by which `evaluate` recognises its own pictures; other formats name it differently.
         made_by = {"Software": "stream-dmr evaluate"} if path.suffix in ("", ".png") else None
         figure.savefig(path, dpi=110, metadata=made_by)
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib doesn't know

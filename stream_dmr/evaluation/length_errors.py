@@ -62,7 +62,7 @@ def length_histogram(
 
 
 def histogram_bias_mm(predicted: Histogram, truth: Histogram) -> float:
-    """Mean of the predicted distribution minus the mean of the true one, in mm."""
+    """Mean of the predicted distribution minus mean of the true distribution, in mm."""
     return float(truth.centers_mm @ (predicted.shares - truth.shares))
 
 
@@ -81,7 +81,7 @@ def histogram_rmsd(predicted: Histogram, truth: Histogram) -> float:
 
 
 def histogram_kl(predicted: Histogram, truth: Histogram, *, pseudo_count: float) -> float:
-    """Kullback-Leibler divergence of the predicted distribution from the true one, in nats.
+    """Kullback-Leibler divergence of the predicted from the true distribution, in nats.
 
     sum_b t_b log(t_b / p_b). An empty bin would make it infinite, so `pseudo_count` fish are added
     to every bin of both beforehand (1/2: Krichevsky and Trofimov, 1981).

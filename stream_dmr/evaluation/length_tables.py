@@ -1,6 +1,6 @@
-"""The tables that `stream-dmr evaluate` reads: lengths, true lengths, and histograms of them.
+"""Read the tables of `stream-dmr evaluate`: lengths, true lengths, and histograms of them.
 
-- Lengths, as `run` writes lengths.csv: track_id, length_mm and, if present, length_std_mm,
+- Lengths, as in a run's lengths.csv: track_id, length_mm and, if present, length_std_mm,
   ci95_low_mm, ci95_high_mm; other columns are ignored. An empty length_mm: not measured.
 - Truth: track_id, length_mm.
 - A histogram: bin_low_mm, bin_high_mm and either count (fish) or share (at any scale), one row per
@@ -58,7 +58,7 @@ def read_lengths(path: Path) -> dict[int, LengthRow]:
 
 
 def read_truth(path: Path) -> dict[int, float]:
-    """True length in mm by track_id. Raises UserError where a fish has none."""
+    """True length in mm by track_id. Raises UserError if a fish has none."""
     truth: dict[int, float] = {}
     for track_id, row in read_lengths(path).items():
         if row.length_mm is None:
@@ -145,7 +145,7 @@ def _required(record: _Record, column: str, where: str) -> float:
 
 
 def _number(record: _Record, column: str, where: str) -> float | None:
-    """A finite number; None where the field is empty or missing."""
+    """A finite number; None if the field is empty or missing."""
     text = (record.get(column) or "").strip()
     if not text:
         return None

@@ -13,13 +13,13 @@ from stream_dmr.errors import OutputError, reason_of
 from stream_dmr.files import read_small
 from stream_dmr.store.ledger import SIGNATURE_BYTES, Signer, is_signature
 
-CONTENT = "stream-dmr digest.json"  # the first name in the zip, by which `is_made_by` knows it
-ENTRY_BYTES = 30 + 46  # that the zip has of a picture beside its name, which stands there twice
+CONTENT = "stream-dmr digest.json"  # the first name in the zip, which `is_made_by` looks for
+ENTRY_BYTES = 30 + 46  # of the zip for a picture, beside its name, which the zip contains twice
 _MAX_CONTENT_BYTES = 2_000_000  # some ten thousand fish; a small zip may hold gigabytes of zeros
 
 
 def pack(content: Mapping[str, Any], pictures: Mapping[str, bytes], signer: Signer) -> bytes:
-    """The bytes of the file, signed where there is a key; the same for the same content."""
+    """The bytes of the file, signed if there is a key; the same for the same content."""
     text, packed = json.dumps(content, separators=(",", ":"), ensure_ascii=False), io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, data in {CONTENT: text.encode(), **pictures}.items():
@@ -32,9 +32,9 @@ def pack(content: Mapping[str, Any], pictures: Mapping[str, bytes], signer: Sign
 
 
 def read_digest(path: Path, key: Ed25519PublicKey | None = None) -> dict[str, Any] | None:
-    """What a digest says; None where `key` did not sign every byte of it.
+    """The content of a digest; None if `key` did not sign every byte of it.
 
-    Raises OutputError where it can't be read.
+    Raises OutputError if it can't be read.
     """
     try:
         data = read_small(path)

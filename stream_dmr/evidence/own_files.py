@@ -19,10 +19,10 @@ _HEAD_BYTES = 4096  # in which a page or picture of ours names the command that 
 def require_writable(
     *paths: Path, overwrite: bool = False, is_own: Callable[[Path], bool] = lambda path: False
 ) -> None:
-    """Raise OutputError where a command must not write to one of `paths`.
+    """Raise OutputError if a command must not write to one of `paths`.
 
-    A file that is there needs `overwrite`, unless `is_own` says that the command made it; what a
-    run measured is never written over, also not by way of a link.
+    An existing file needs `overwrite`, unless the command made it (`is_own`); measurements of a run
+    are never overwritten, also not through a link.
     """
     for path in paths:
         if is_of_run(path.resolve()):
@@ -40,7 +40,7 @@ def require_writable(
 def is_of_run(path: Path) -> bool:
     """True for the name of a file that a run writes into its folder.
 
-    An .rrd is one where the run's provenance knows it, or where no .mcap holds the same.
+    An .rrd is one if the run's provenance lists it, or if there is no .mcap of the same content.
     """
     folder = path.parent
     if not (folder / DATABASE).exists() and read_origin(folder) != folder:
@@ -51,7 +51,7 @@ def is_of_run(path: Path) -> bool:
 
 
 def has_run_name(path: Path) -> bool:
-    """True for a name that a run gives to its files, whatever the folder."""
+    """True for a name that runs use for their files, in any folder."""
     return bool(_OF_RUN.fullmatch(path.name))
 
 

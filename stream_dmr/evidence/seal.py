@@ -40,7 +40,7 @@ from stream_dmr.version import __version__
 
 RECORDINGS = ("*.mcap", "*.rrd")
 CONTINUED = ("lengths.csv", "frames.csv")  # tables to which the next run in a folder adds rows
-# What a camera's run closes and signs while it goes on.
+# Files that a camera's run closes and signs while it continues.
 _CLOSED = (*RECORDINGS, "frames-[0-9]*.csv")
 
 
@@ -57,7 +57,7 @@ class SignedFiles:
         self._lock = Lock()
 
     def attach(self, store: LengthStore, *, repaired: Iterable[Path]) -> None:
-        """Sign from now on; first what changed before, and what lies there and nobody signed."""
+        """Sign from now on, beginning with earlier changes and unsigned files in the folder."""
         if not store.is_signing:
             return
         with self._lock:
@@ -86,7 +86,7 @@ class SignedFiles:
     def _sign(self, path: Path, kind: str) -> None:
         if self._store is None:
             return
-        with suppress(OSError):  # it is not signed, which `verify` says
+        with suppress(OSError):  # it stays unsigned, and `verify` reports it
             if path.exists():
                 self._store.sign_file(kind, path.name, sha256_of(path))
             else:
@@ -94,7 +94,7 @@ class SignedFiles:
 
 
 def sign_found(folder: Path, paths: Sequence[Path], signer: Signer) -> None:
-    """Sign files that lie in a folder where no run is writing, as found; lengths.csv as it is."""
+    """Sign files in a folder without a running run, as found; lengths.csv as it is."""
     with closing(open_for_writing(folder / DATABASE)) as database:
         signer.continue_chain(database)
         found = [(FOUND, path) for path in paths if path.exists()]
@@ -112,7 +112,7 @@ def log_sum(lines: Sequence[str]) -> dict[str, Any]:
 
 
 def begins_as(lines: Sequence[str], known: Mapping[str, Any]) -> bool:
-    """True where the rows that a sum knows are still there as they were; others may follow."""
+    """True if the rows of a known sum are unchanged; others may follow."""
     return log_sum(lines[: known["count"]]) == known
 
 
@@ -123,10 +123,10 @@ NAME = "provenance.json"
 def sealed(
     folder: Path, *, with_recordings: bool, on_notice: Callable[[str], None]
 ) -> Generator[None]:
-    """Write the provenance of a run's results when it ends, however it does.
+    """Write the provenance of a run's results when it ends, in any way.
 
-    Recordings of months are left out: a run that is asked to stop has no time to read them. What a
-    full disk refuses is a notice: the lengths are there.
+    Recordings of months are left out: a run that is asked to stop has no time to read them. If a
+    full disk refuses it, that is a notice: the lengths are there.
     """
     try:
         yield
@@ -141,8 +141,8 @@ def sealed(
 def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """Write the provenance of a run's own results. OutputError.
 
-    Reviewers go on writing to the database, so its tables are summed up, those of fish and events
-    by their runs.
+    Reviewers continue to write to the database, so its tables are summed up, the tables of fish and
+    events by their runs.
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else CONTINUED
@@ -176,8 +176,8 @@ def seal_files(
 ) -> Path:
     """Add the checksums and inputs of `files`; entries of other files stay.
 
-    `origin` is the folder or recording that they were exported from. OutputError, also where what
-    is said of others is damaged.
+    `origin` is the folder or recording that they were exported from. OutputError, also if the
+    entries of other files are damaged.
     """
     try:
         made = read_provenance(folder) or _new(runs, origin)
@@ -192,8 +192,8 @@ def seal_files(
 def add_files(folder: Path, files: Iterable[Path]) -> None:
     """Add the checksums of `files`, new or written again. Raises OutputError.
 
-    What it says of others stays, whatever has become of them. One that is missing or damaged stays
-    so: it is for `verify` to find.
+    The entries of other files stay, in any state of these files. A missing or damaged provenance
+    stays so, for `verify` to find.
     """
     if (made := _if_readable(folder)) is not None:
         _write(folder, made | {"files": made["files"] | _sums(folder, files)})
@@ -202,7 +202,7 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
 def seal_verdicts(folder: Path) -> None:
     """Update the sum of the verdicts, as `add_files` does.
 
-    Where those that were known have been changed, it stays at them, for `verify` to find.
+    If known verdicts have been changed, the sum stays as it was, for `verify` to find.
     """
     _seal_log(folder, "verdicts", verdict_lines(folder / DATABASE))
 
@@ -240,13 +240,13 @@ def _write(folder: Path, made: dict[str, Any]) -> Path:
 
 
 def read_origin(folder: Path) -> Path | None:
-    """The source of a folder's files: the folder itself where a run wrote it; None: unknown."""
+    """The source of a folder's files: the folder itself if a run wrote it; None if unknown."""
     made = _if_readable(folder)
     return None if made is None else Path(made.get("origin") or folder)
 
 
 def known_files(folder: Path) -> Sequence[str]:
-    """The names of the files that provenance.json knows; none where it is missing or damaged."""
+    """The names of the files in provenance.json; none if it is missing or damaged."""
     made = _if_readable(folder)
     return [] if made is None else list(made["files"])
 
@@ -259,7 +259,7 @@ def _if_readable(folder: Path) -> dict[str, Any] | None:
 
 
 def read_provenance(folder: Path) -> dict[str, Any] | None:
-    """The content of provenance.json; None without one. ValueError where it is damaged."""
+    """The content of provenance.json; None without it. ValueError if it is damaged."""
     path = folder / NAME
     if not path.is_file():
         return None

@@ -20,7 +20,7 @@ from stream_dmr.store.batch_folder import (
     read_videos,
 )
 
-Finding = tuple[Path, str]  # a file, and what is wrong with it
+Finding = tuple[Path, str]  # a file and its problem
 
 
 def check_batch(out: Path) -> Iterator[Finding]:

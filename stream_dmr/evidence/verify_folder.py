@@ -88,7 +88,7 @@ T = TypeVar("T")
 
 
 def guarded(check: Iterable[T], finding: Callable[[str], T]) -> Iterator[T]:
-    """The findings of a check, and `finding` where what it reads is too broken to go on."""
+    """The findings of a check, and `finding` if its files are too broken to continue."""
     try:
         yield from check
     except Exception as error:  # rows and JSON that others wrote may hold anything
@@ -98,12 +98,12 @@ def guarded(check: Iterable[T], finding: Callable[[str], T]) -> Iterator[T]:
 
 
 def changed_edits(database: Path, last_frames: Mapping[int, int]) -> Iterator[str]:
-    """What is not as reviewers made it, one line each. Raises OutputError.
+    """Edits that are not as reviewers made them, one line each. Raises OutputError.
 
     `last_frames` by recorded track.
     """
     verdicts, frames = read_verdicts(database), read_added_frames(database)
-    said = {one.track_id: one.frames_sha256 for one in verdicts if one.kind == "add"}
+    said = {added.track_id: added.frames_sha256 for added in verdicts if added.kind == "add"}
     for track_id in sorted(frames.keys() | said.keys()):
         if frames_sha256(frames.get(track_id, [])) != said.get(track_id):
             yield f"fish {track_id}: its frames are not those that a reviewer added"
@@ -138,7 +138,7 @@ def _corrections(
         said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
         of_reader = blind_readings(said).get(verdict.reviewer, [])
         counted = standing(said) if verdict.reading is None else of_reader
-        of_fish = [one for one in counted if one.track_id == verdict.track_id]
+        of_fish = [other for other in counted if other.track_id == verdict.track_id]
         review = reviews_of(of_fish).get(verdict.track_id, NOT_REVIEWED)
         moved = {**review.moved, **verdict.moved}
         missing = [frame for frame in moved if (verdict.track_id, frame) not in fits]
@@ -168,10 +168,10 @@ def _corrections(
 
 
 def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) -> Iterator[str]:
-    """Compare each fish with what its frames give, where the recording still has them all."""
+    """Compare each fish with the length by its frames, if the recording still has them all."""
     recording = open_recordings([database.parent])
     settings = settings_of(recording)
-    tracks = {part.track_id for one in edits.fish.values() for part in one.parts}
+    tracks = {part.track_id for fish in edits.fish.values() for part in fish.parts}
     frames = frames_of_tracks(recording, database, tracks, last_frames)
     for track_id, edited in edits.fish.items():
         try:
@@ -180,7 +180,7 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
             yield f"fish {track_id}: its tracks are in view together"
             continue
         if len(chosen) < edited.row["frames_seen"] and any(database.parent.glob("recording-*")):
-            continue  # the oldest segments of a camera are deleted where room is short
+            continue  # the oldest segments of a camera are deleted if room is short
         expected = edited_row(chosen, settings, ()) if chosen else {}
         for name, now in edited.row.items():
             if name not in _NOT_COMPUTED and now != expected.get(name):
@@ -199,10 +199,10 @@ class Change(NamedTuple):
 
 
 def verify(folder: Path) -> tuple[list[Change], int]:
-    """Check a folder of results, exports or a batch and those in it.
+    """Check a folder of results, exports or a batch, and the folders in it.
 
-    Returns what was changed, and the number of files checked. Raises UserError where there is
-    nothing to check.
+    Returns the changes found, and the number of files checked. Raises UserError if there is nothing
+    to check.
     """
     marks = (DATABASE, PROVENANCE, VIDEOS)
     places = {path.parent for name in marks for path in folder.rglob(name)}
@@ -220,7 +220,7 @@ def verify(folder: Path) -> tuple[list[Change], int]:
 
 
 def _changes(folder: Path) -> Iterator[Change]:
-    """The walk over one folder: each check is of its own, and none stops the next."""
+    """The changes in one folder: the checks are independent, and none stops the next."""
     for path in sorted(folder.iterdir()):
         if not path.is_file() and not path.is_dir():
             yield Change(path, "is no file: a pipe, a device or a link to nothing")
@@ -246,7 +246,7 @@ def _changes(folder: Path) -> Iterator[Change]:
         yield from _csv(table, LENGTHS_COLUMNS, lengths, witness=DATABASE, cuts=cuts)
     frames: dict[str, list[str]] = {}
     cuts = list[int]()
-    # Every .mcap, and an .rrd, which is slow to read, where nothing knows it.
+    # Every .mcap, and an .rrd, which is slow to read, only if the provenance doesn't list it.
     known = known_files(folder)
     ends = ("", ".part", f".part{DAMAGED}")
     found = [path for end in ends for path in folder.glob(f"*.mcap{end}")]
@@ -258,7 +258,7 @@ def _changes(folder: Path) -> Iterator[Change]:
         check, is_left = _recording(recording, runs, fish, frames), recording.suffix == ".part"
         findings = list(_broken(recording, check, is_by_crash=is_cut and is_left))
         yield from findings
-        if any(one.path == recording and one.is_by_crash for one in findings):
+        if any(change.path == recording and change.is_by_crash for change in findings):
             cuts.append(len(frames))
     if frames:
         table, witness = folder / "frames.csv", "the recording"
@@ -294,12 +294,12 @@ def _stored(
 
 
 def _has_crashed(runs: Mapping[str, RunFacts]) -> bool:
-    return any(one.ended_by == NOT_ENDED for one in runs.values())
+    return any(facts.ended_by == NOT_ENDED for facts in runs.values())
 
 
 def _unfinished_run(runs: Mapping[str, RunFacts]) -> str:
-    """The last run, where it has no end: a crash may have cut off the tables, too; else ""."""
-    return next((one for one in [*runs][-1:] if runs[one].ended_by == NOT_ENDED), "")
+    """The last run, if it has no end: a crash may have cut off the tables, too; else ""."""
+    return next((run_id for run_id in [*runs][-1:] if runs[run_id].ended_by == NOT_ENDED), "")
 
 
 def summary(database: Path) -> Iterator[str]:
@@ -314,7 +314,7 @@ def summary(database: Path) -> Iterator[str]:
 
 
 def utc(time_ns: int | None) -> str:
-    """UTC to the second; "?" where it is unknown or no time."""
+    """UTC to the second; "?" if it is unknown or no time."""
     try:
         return datetime.fromtimestamp(int(time_ns or "") / 1e9, UTC).isoformat(timespec="seconds")
     except (ValueError, OverflowError, OSError, TypeError):
@@ -342,7 +342,7 @@ def _against_provenance(folder: Path, runs: Mapping[str, RunFacts]) -> Iterator[
     database = database_of(folder)
     if database is None:
         return
-    # Tables that nothing of stream-dmr wrote, though their names may look like it; a camera's
+    # Tables that stream-dmr did not write, though their names may look like it; a camera's
     # frames.csv, whose recordings are not sealed, is rotated.
     tables = {path for path in folder.glob("*.csv") if path.name not in made["files"]}
     if not any(name.endswith((".mcap", ".rrd")) for name in made["files"]):
@@ -362,7 +362,7 @@ def _fish_and_runs(database: Path, made: dict[str, Any]) -> Iterator[str]:
         if lines_sha256(stored.get(run_id, [])) != expected:
             yield f"the fish of run {run_id} are not those that were measured"
     runs, events, times = read_runs(database), rows_by_run(database, EVENTS), run_times(database)
-    for run_id, known in made.get("run_times_ns", {}).items():  # older ones have neither of these
+    for run_id, known in made.get("run_times_ns", {}).items():  # older files have neither of these
         if times.get(run_id) != known:
             yield f"run {run_id}: its times are not those of its run"
         expected = made["events_sha256"].get(run_id)
@@ -373,13 +373,13 @@ def _fish_and_runs(database: Path, made: dict[str, Any]) -> Iterator[str]:
     for run_id, facts in made["runs"].items():
         for column in fields(RunFacts):
             now = getattr(runs.get(run_id), column.name, "missing")
-            was = facts.get(column.name, column.default)  # older ones have fewer
+            was = facts.get(column.name, column.default)  # older files have fewer
             if now != was:
                 yield f"run {run_id}: {column.name} is {now!r}, was {was!r}"
 
 
 def _state(database: Path, made: dict[str, Any]) -> Iterator[str]:
-    """The other tables against provenance.json, which older ones don't sum up."""
+    """Compare the other tables with provenance.json; older ones have no sums of them."""
     known = made.get("checks")
     if known is None:
         return
@@ -392,7 +392,7 @@ def _state(database: Path, made: dict[str, Any]) -> Iterator[str]:
 
 
 def _unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
-    """Positions, watched times and hauls against provenance.json; an older one knows none."""
+    """Compare positions, watched times and hauls with provenance.json; older ones have none."""
     for table in (POSITIONS, WATCHED):
         sealed: dict[str, str] | None = made.get(f"{table.name}_sha256")
         if sealed is None:
@@ -432,7 +432,8 @@ def _recording(
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
     recording, database = open_recordings([path]), path.parent / DATABASE
     made_by = attrgetter(*_MADE_BY)
-    made, of_runs = made_by(run_facts(recording.header)), [made_by(one) for one in runs.values()]
+    made = made_by(run_facts(recording.header))
+    of_runs = [made_by(facts) for facts in runs.values()]
     if of_runs and made not in of_runs:
         for name, now, was in zip(_MADE_BY, made, of_runs[0], strict=True):
             if now != was:
@@ -456,7 +457,7 @@ def _recording(
                 now, was = stored.get(column), getattr(message, column)
                 if now != was:
                     yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")
-    # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole one.
+    # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole file.
     is_cut_off = path.suffix == ".mcap" and is_torn(path)
     for line in recording.warnings:
         what = line.removeprefix(f"{path}: ")
@@ -473,8 +474,8 @@ def _csv(
 ) -> Iterator[Change]:
     """Compare a table with rows of a witness; only frames.csv may have more rows.
 
-    `cuts`: numbers of rows of the witness after which a crash came; it may have kept from the table
-    what stands right before.
+    `cuts`: numbers of rows of the witness after which a crash came; the rows right before may be
+    missing in the table.
     """
     if not path.is_file():
         yield Change(path, "is missing")
@@ -487,7 +488,7 @@ def _csv(
             yield Change(table, "its columns are not those of stream-dmr")
             return
         found |= found_rows
-    # Where room was short the oldest tables went, maybe with some rows of the first frame left.
+    # If room was short the oldest tables were deleted, maybe within the rows of a frame.
     first = min((int(row[0]) for row in found.values()), default=0) if older else 0
     names = [*expected]
     kept_by_crash = {
@@ -512,7 +513,7 @@ def _csv(
 
 
 def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
-    """Rows by their fish, or by frame and fish; None where the columns are others."""
+    """Rows by their fish, or by frame and fish; None if the columns differ."""
     table = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8", errors="replace"))))
     if not table or table[0] != list(columns):
         return None

@@ -46,11 +46,11 @@ from stream_dmr.store.verdicts import read_verdicts
 
 
 class SignatureCheck(NamedTuple):
-    """What was found in one folder."""
+    """The findings of one folder."""
 
     changes: list[str]
-    crashes: list[str]  # what a crash explains, or somebody who cut off what came last
-    notes: list[str]  # what a reader must know beside
+    crashes: list[str]  # losses at the end, by a crash or by somebody who cut it off
+    notes: list[str]  # further facts for readers
 
 
 def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
@@ -94,7 +94,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
 
 
 class _Signed(NamedTuple):
-    """The signed entries of a folder, and what is in the folder."""
+    """The signed entries of a folder, and its content."""
 
     folder: Path
     database: sqlite3.Connection
@@ -108,7 +108,7 @@ class _Signed(NamedTuple):
         return {entry.name: entry.content_sha256 for entry in self.of(kind)}
 
     def unfinished_run(self) -> ChainEntry | None:
-        """The begin of the last run, where its end is not signed."""
+        """The begin of the last run, if its end is not signed."""
         last = next(reversed(self.of(RUNS.kind)), None)
         return last if last and last.name not in self.hashes(END) else None
 
@@ -118,7 +118,7 @@ def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
 
 
 def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> Iterator[str]:
-    """Add the entries to `entries`; those that are damaged are findings instead."""
+    """Add the entries to `entries`; damaged entries are findings instead."""
     for row in rows(database, LEDGER):
         if is_entry(row):
             entries.append(ChainEntry(**row))
@@ -127,7 +127,7 @@ def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> I
 
 
 def _added(signed: _Signed, table: Table) -> Iterator[str]:
-    """What was changed, removed or put in, a line each kind; people may add hauls to a folder."""
+    """Rows changed, removed or put in, a line each kind; people may add hauls to a folder."""
     missing, surplus = _unmatched(signed, table)
     if missing:
         yield f"{missing} of its {table.name} are missing, or not as they were signed"
@@ -149,10 +149,11 @@ def _unmatched(signed: _Signed, table: Table) -> tuple[int, int]:
 
 def _unsigned_verdicts(database: Path) -> Iterator[str]:
     """Each verdict: reviewers have no keys, so anybody who can write to the file can add one."""
-    for number, one in enumerate(read_verdicts(database), start=1):
-        length = "" if one.length_mm is None else f" to {one.length_mm} mm"
-        what = f"{one.kind} fish {one.track_id}{length}"
-        yield f"verdict {number} of {utc(one.written_ns)} by {one.reviewer!r}: {what}; not signed"
+    for number, verdict in enumerate(read_verdicts(database), start=1):
+        length = "" if verdict.length_mm is None else f" to {verdict.length_mm} mm"
+        by = f"{utc(verdict.written_ns)} by {verdict.reviewer!r}"
+        what = f"{verdict.kind} fish {verdict.track_id}{length}"
+        yield f"verdict {number} of {by}: {what}; not signed"
 
 
 def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Iterator[str]:
@@ -168,7 +169,7 @@ def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Itera
 
 
 def _rows_by_name(signed: _Signed, table: Table, stored: Iterable[Row]) -> Iterator[str]:
-    """Rows that were changed, removed, put in or moved; their name is what the entries say."""
+    """Rows changed, removed, put in or moved, by their names in the entries."""
     kind, hashes = table.kind, signed.hashes(table.kind)
     column = "run_id" if table is RUNS else "track_id"
     contents = [(str(row[column]), _content(row)) for row in stored]
@@ -221,16 +222,16 @@ def _last_run(signed: _Signed) -> Iterator[str]:
 
 
 def _signature_state(signed: _Signed) -> Iterator[str]:
-    """Marks, clips and scenes as the last run left them, where it came to its end."""
+    """Changes of marks, clips and scenes since the last run, if it came to its end."""
     state, last = content_sha256(read_state(signed.database)), signed.of(RUNS.kind, STATE)
     if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
         yield "its marks, clips or scenes are not as they were signed"
 
 
 def _checks(signed: _Signed) -> Iterator[str]:
-    """The checks of the scale: each run signs those that were there at its end."""
+    """Changes of the checks of the scale: each run signs the checks known at its end."""
     checks, known = check_lines(signed.database), signed.of(CHECKS.kind)
-    if any(lines_sha256(checks[: int(one.name)]) != one.content_sha256 for one in known):
+    if any(lines_sha256(checks[: int(entry.name)]) != entry.content_sha256 for entry in known):
         yield "the checks of the scale are not as they were signed"
 
 

@@ -207,7 +207,7 @@ def _render_frame(
     num_pixels: dict[int, int] = {}
     visits = scene.visits_at(frame_index)
     posed = {visit.fish.track_id: scene.pose(visit, frame_index) for visit in visits}
-    # Far ones first, so that near ones cover them.
+    # Far fish first, so that near fish cover them.
     for visit in sorted(visits, key=lambda v: -posed[v.fish.track_id].keypoints[1, 2]):
         track_id = visit.fish.track_id
         patch = _draw_fish(scene, visit, posed[track_id], image, backdrop, frame_index)

@@ -67,7 +67,7 @@ PRESETS = {
 
 
 def find_preset(name: str) -> Preset:
-    """The preset of this name. Raises UserError for another name, listing those that exist."""
+    """The preset of this name. Raises UserError for another name, with the list of presets."""
     if name not in PRESETS:
         raise UserError(f"--preset: expected one of {', '.join(PRESETS)}, got {name!r}")
     return PRESETS[name]
@@ -199,7 +199,7 @@ def make_scene(
 ) -> RailScene:
     """A random scene; equal arguments give equal scenes. Track ids count from 1.
 
-    Up to three fish are in the picture together; the first and last frames, and those between
+    Up to three fish are in the picture together; the first and last frames, and the frames between
     groups of three, are empty. Several `species` take turns.
     """
     chosen = find_preset(preset)
@@ -238,7 +238,7 @@ def draw_calibration(rng: np.random.Generator) -> Calibration:
 def second_camera(calibration: Calibration, *, degrees: float) -> Calibration:
     """The same camera, carried round the upright line through the fish before it by an angle."""
     plane = calibration.plane
-    # Where the camera looks at the plane, in the plane's coordinates.
+    # The point of the plane that the camera looks at, in the plane's coordinates.
     middle_mm = plane.depth_mm(np.array([[0.0, 0.0, 1.0]]))[0] * np.array([0.0, 0.0, 1.0])
     pivot_mm = plane.rotation.T @ (middle_mm - plane.translation_mm)
     turn, _ = cv2.Rodrigues(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))

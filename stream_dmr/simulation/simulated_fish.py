@@ -61,8 +61,8 @@ class SimulatedBody:
     ) -> Float[np.ndarray, "*N 3"]:
         """Points (s, y, z) of the surface; the angle (rad) runs around the section at s.
 
-        Sections become thin towards both edges, like the long fins, and those of the tail fin are
-        curved backwards into its two lobes.
+        Sections become thin towards both edges, like the long fins, and sections of the tail fin
+        are curved backwards into its two lobes.
         """
         across = np.cos(angle)
         through = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 1.5
@@ -128,7 +128,7 @@ def _faces(num_rings: int, num_sides: int) -> Int[np.ndarray, "F 3"]:
     last, k = ring[-1], np.arange(num_sides // 2)
     upper, upper_after = last[k], last[k + 1]
     lower, lower_after = last[-k], last[-k - 1]
-    # The last one of the first half has no area, nor has the first one of the second.
+    # The last face of the first half has no area, nor has the first face of the second.
     seam = np.stack([upper, upper_after, lower_after], axis=-1)[:-1]
     return np.concatenate([snout, *sides, seam, np.stack([upper, lower_after, lower], axis=-1)[1:]])
 
@@ -239,7 +239,7 @@ class SimulatedFish:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HangingPose:
-    """How a fish hangs in one frame."""
+    """The bends and angles of a hanging fish in one frame."""
 
     bends: Float[np.ndarray, "3 K"]  # see `curvature`
     yaw_rad: float  # about the vertical; 0 shows the side with the eyes, pi the blind side
@@ -300,7 +300,7 @@ def _hang(fish: SimulatedFish, pose: HangingPose) -> CenterLine:
     line = bend_center_line(pose.bends, length_mm=fish.length_mm)
     middle = line.frames[len(line.frames) // 2]
     line = line.moved(middle.T, np.zeros(3))
-    # Gravity pulls the centroid under the head, where the hook is.
+    # Gravity pulls the centroid under the head, which the hook holds.
     down = line.points.mean(axis=0) - line.points[0]
     align = Rotation.align_vectors([[1.0, 0.0, 0.0]], [down])[0]
     swing = Rotation.from_euler("ZXY", [pose.sway_rad, pose.tilt_rad, pose.yaw_rad])
@@ -335,7 +335,7 @@ SPECIES: dict[str, SimulatedBody] = {"halibut": HALIBUT} | {
 
 
 def find_species(names: str) -> list[SimulatedBody]:
-    """The mean bodies of these names, joined by commas. Raises UserError for an unknown one."""
+    """The mean bodies of these names, joined by commas. Raises UserError for an unknown name."""
     for name in names.split(","):
         if name not in SPECIES:
             raise UserError(f"--species: expected any of {', '.join(SPECIES)}, got {name!r}")
@@ -412,12 +412,12 @@ def texture_grid(
 
 
 def _noise(rng: np.random.Generator, grain: float) -> Float32[np.ndarray, "S Y"]:
-    # The texture is about as dense across as along where the body is broad.
+    # At its broadest the body has a texture about as dense across as along.
     return noise(rng, _ALONG, _ACROSS, grain_px=(grain, grain))
 
 
 def _fins(s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]) -> Float[np.ndarray, "S Y"]:
-    """Darker where the long fins fringe the body, and rays in the tail fin."""
+    """Factors of tone: darker long fins along the edges, and rays in the tail fin."""
     fringe = 1 / (1 + np.exp(-(np.abs(y) - 0.78) / 0.03)) * ((s > 0.2) & (s < 0.86))
     rays = 0.12 * (np.sin(40 * y) > 0) * (s > 0.9) + 0.15 * (s > 0.9)
     return 1 - 0.28 * fringe - rays

@@ -45,7 +45,7 @@ TRUTH_FRAMES_COLUMNS = (
 
 
 def scene_files(species: str) -> tuple[str, ...]:
-    """The names of what `simulate` writes into a folder for these species."""
+    """The names of the files that `simulate` writes into a folder for these species."""
     names = species.split(",")
     meshes = ["species"] if len(names) == 1 else names
     listed = () if len(names) == 1 else ("species.csv",)
@@ -71,12 +71,12 @@ def simulate(
     `video.mp4`, `boxes.txt`, `masks/`, `calibration.yaml`, `truth.csv` (length per fish),
     `truth_frames.csv` (per fish and frame: keypoints in the camera frame in mm and in frame
     pixels with lens distortion, arc, bending), and `species.ply` with `species.toml`, the mean
-    body as a template. Of several `species`, names joined by commas, which take turns, there is a
-    mesh of each, and `species.csv` says which fish is which. With `second_deg` the folder `second`
-    has the same fish, filmed at the same moments by a camera carried round them by that angle.
-    Equal arguments write equal masks and truth to the last bit.
+    body as a template. Several `species`, names joined by commas, take turns: there is a mesh of
+    each, and `species.csv` has the species of each fish. With `second_deg` the folder `second` has
+    the same fish, filmed at the same moments by a camera carried round them by that angle. Equal
+    arguments write equal masks and truth to the last bit.
 
-    Raises UserError for counts, a preset, a species or a seed out of range, OutputError where `out`
+    Raises UserError for counts, a preset, a species or a seed out of range, OutputError if `out`
     can't be written to.
     """
     if not 0 <= num_fish <= _MAX_FISH:
@@ -109,7 +109,7 @@ def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> Non
                 path.unlink()
         _write_all_species(out, species.split(","), num_fish=len(scene.visits))
         fish = [visit.fish for visit in scene.visits]
-        lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
+        lengths = [(single.track_id, f"{single.length_mm:.6f}") for single in fish]
         write_table(out / "truth.csv", ("track_id", "length_mm"), lengths)
         write_table(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
         save_calibration(out / "calibration.yaml", scene.calibration)
@@ -172,7 +172,7 @@ def _write_film(out: Path, scene: RailScene) -> None:
         with (out / "boxes.txt").open("w", encoding="utf-8") as boxes:
             for shot in film(scene):
                 video.write(shot.image)
-                # Unlike cv2.imwrite, write_bytes raises an error that says what went wrong.
+                # Unlike cv2.imwrite, write_bytes raises an error with the reason.
                 png = encode_mask(shot.labels, num_fish=len(scene.visits))
                 (out / "masks" / f"{shot.frame_index:06d}.png").write_bytes(png)
                 boxes.writelines(map(_mot_line, shot.boxes))
