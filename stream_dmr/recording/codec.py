@@ -84,7 +84,7 @@ def _add_field(message: DescriptorProto, label: str, kind: str, name: str, numbe
         field.type = _PROTO_SCALARS[kind]
     else:
         field.type, field.type_name = field.TYPE_MESSAGE, f".{PACKAGE}.{kind}"
-    if label == "optional ":  # as protoc does: a oneof of one field, so that presence is known
+    if label == "optional ":  # as in protoc: a oneof of a single field, so that presence is known
         field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
         message.oneof_decl.add(name=f"_{name}")
 
@@ -170,7 +170,7 @@ def decompress(picture: EncodedPicture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.
 
 
 def checksum(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """A checksum by which a picture of the source is known to be the recorded one.
+    """A checksum that identifies the recorded picture in the source.
 
     CRC-32 of the sums, modulo 2^64, of the BGR bytes in blocks of 512 little-endian 64-bit words,
     the last block filled with zeros. Any single changed byte changes it, and it takes a fifth of
@@ -245,8 +245,8 @@ def encode(message: object, *, picture: EncodedPicture | None = None) -> bytes:
 def decode(kind: type[T], data: bytes) -> T:
     """The message of type `kind` that `encode` wrote.
 
-    The image of a Frame recorded by reference has the shape (0, 0, 3). Raises RecordingError where
-    the bytes are no such message.
+    The image of a Frame recorded by reference has the shape (0, 0, 3). Raises RecordingError if the
+    bytes are no such message.
     """
     proto = proto_class(kind.__name__)()
     try:
@@ -361,7 +361,7 @@ def _get(proto: Proto, field: Any) -> Any:
     inner = getattr(proto, field.name)
     if field.is_repeated:
         of_value = field.message_type.fields[1].name
-        return {one.name: getattr(one, of_value) for one in inner}
+        return {entry.name: getattr(entry, of_value) for entry in inner}
     if field.has_presence and not proto.HasField(field.name):
         if field.containing_oneof is None:  # so the schema doesn't say `optional`
             raise RecordingError(

@@ -33,7 +33,7 @@ class FrameRestorer(Protocol):
 
 
 def has_original_pixels(frame: Frame, payload: bytes) -> bool:
-    """True where a frame has the very pixels that the run continued with."""
+    """True if a frame has the very pixels that the run continued with."""
     crc32 = stored_picture(payload).crc32
     return frame.image.size > 0 and (crc32 == 0 or checksum(frame.image) == crc32)
 
@@ -45,7 +45,7 @@ class SourcePictures:
         self._frames: Iterator[Frame] = iter(frames)
 
     def restore(self, frame: Frame, payload: bytes) -> Frame:
-        """The frame with its image. Raises SourceError where the source doesn't have it."""
+        """The frame with its image. Raises SourceError if the source doesn't have it."""
         if has_original_pixels(frame, payload):
             return frame
         for found in self._frames:
@@ -68,7 +68,7 @@ class SourcePictures:
 class ClipPictures:
     """The images of a folder of clips: each frame is found in its clip by its checksum.
 
-    Frames are numbered over all clips and restarts, so their numbers say nothing of the clips.
+    Frames are numbered over all clips and restarts, so their numbers don't identify the clips.
     """
 
     def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
@@ -78,12 +78,12 @@ class ClipPictures:
         self._frames: Iterator[Frame] = iter(())
 
     def restore(self, frame: Frame, payload: bytes) -> Frame:
-        """The frame with its image. Raises SourceError where its clip doesn't have it."""
+        """The frame with its image. Raises SourceError if its clip doesn't have it."""
         if has_original_pixels(frame, payload):
             return frame
         crc32 = stored_picture(payload).crc32
         is_open = self._name == frame.source
-        for _ in range(1 + is_open):  # after a restart a clip goes on from before where it was
+        for _ in range(1 + is_open):  # after a restart a clip continues from an earlier frame
             if not is_open:
                 self._open(frame.source)
             for found in self._frames:
@@ -108,7 +108,7 @@ class ClipPictures:
 
 @contextmanager
 def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameRestorer]:
-    """The images of a source that was recorded. Raises SourceError where it can't be read."""
+    """The images of a source that was recorded. Raises SourceError if it can't be read."""
     if Path(source).is_dir() and clips_in(Path(source)):
         with closing(ClipPictures(Path(source), settings)) as pictures:
             yield pictures
@@ -119,7 +119,7 @@ def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameR
 
 @contextmanager
 def open_recorded_source(header: RunHeader) -> Generator[FrameRestorer | None]:
-    """The images of a run's source; None where it is not at hand, or not as it was."""
+    """The images of a run's source; None if it is not at hand, or has changed."""
     source = None if header.inputs is None else header.inputs.source
     if source is None or not source.is_unchanged():
         yield None
@@ -133,13 +133,13 @@ class RecordedPictures:
     """The images that the recording holds: JPEG or PNG as they are, and H.264."""
 
     def __init__(self, recording: Recording, selection: Selection) -> None:
-        # An H.264 picture builds on those before it, back to a key frame.
+        # An H.264 picture depends on the pictures before it, back to a key frame.
         earlier = replace(selection, lead_ns=KEY_FRAME_NS)
         self._pictures = _decoded_video(recording.video(earlier))
         self._next = next(self._pictures, None)
 
     def restore(self, frame: Frame, payload: bytes) -> Frame:
-        """The frame with its image; unchanged where the recording holds none."""
+        """The frame with its image; unchanged if the recording holds none."""
         while self._next is not None and self._next[0] < frame.timestamp_ns:
             self._next = next(self._pictures, None)
         if frame.image.size or self._next is None or self._next[0] > frame.timestamp_ns:
@@ -149,7 +149,7 @@ class RecordedPictures:
 
 
 def _decoded_video(samples: Iterator[bytes]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """Capture times in ns and BGR images; FFmpeg is needed only where there are samples."""
+    """Capture times in ns and BGR images; FFmpeg is needed only if there are samples."""
     first = next(samples, None)
     if first is None:
         return
@@ -160,7 +160,7 @@ def _decoded_video(samples: Iterator[bytes]) -> Iterator[tuple[int, UInt8[np.nda
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundFrame:
-    """A recorded frame with its picture, which is empty where neither source nor recording has it.
+    """A recorded frame with its picture, which is empty if neither source nor recording has it.
 
     `is_original`: these are the very pixels that the run measured.
     """
@@ -173,7 +173,7 @@ class FrameLookup:
     """Finds frames by capture time. Thread-safe."""
 
     def __init__(self, recording: Recording, source: str | None) -> None:
-        """`source`: the path of the recorded source, where it is at hand."""
+        """`source`: the path of the recorded source, if it is at hand."""
         self._recording, self._source = recording, source
         self._video: SeekableVideo | None = None
         if source is not None and Path(source).is_file():
@@ -200,7 +200,7 @@ class FrameLookup:
             self._video.close()
 
     def _of_video(self, frame: Frame, payload: bytes) -> Frame:
-        """The frame as the video has it; unchanged where it isn't the recorded one."""
+        """The frame with the video's picture; unchanged if that isn't the recorded picture."""
         if self._video is None or has_original_pixels(frame, payload):
             return frame
         image = self._video.image_at(frame.timestamp_ns)

@@ -30,18 +30,18 @@ class InputFile:
     """One file or folder that a run was given."""
 
     path: str  # absolute; of a camera or a stream its name, without a password
-    sha256: str = ""  # see `content_sha256`; "" for what can't be read twice, or wasn't recorded
+    sha256: str = ""  # see `content_sha256`; "" if it can't be read twice, or wasn't recorded
 
     @classmethod
     def read(cls, path: str | Path) -> "InputFile":
-        """The place and the content of a file or folder. SourceError where it can't be read."""
+        """The place and the content of a file or folder. SourceError if it can't be read."""
         return cls(path=os.path.abspath(path), sha256=content_sha256(Path(path)))
 
     def exists(self) -> bool:
         return Path(self.path).exists()
 
     def is_unchanged(self) -> bool:
-        """True where the place has the recorded content; unknown content is never the same."""
+        """True if the place has the recorded content; unknown content is never the same."""
         return (
             self.sha256 != "" and self.exists() and content_sha256(Path(self.path)) == self.sha256
         )
@@ -71,7 +71,7 @@ class RunInputs:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "RunInputs | None":
-        """The inverse of `metadata`; None where a recording is too old to have them."""
+        """The inverse of `metadata`; None if a recording is too old to have them."""
         files = {
             field.name: InputFile(path=path, sha256=metadata.get(f"{field.name}_sha256", ""))
             for field in fields(cls)
@@ -88,7 +88,7 @@ class RunInputs:
     def from_command(cls, command: str) -> "RunInputs | None":
         """Inputs by the command of an old recording: paths as typed, and no hashes.
 
-        None where it is no `stream-dmr run` or names no source.
+        None if it is no `stream-dmr run` or names no source.
         """
         try:
             words = [
@@ -108,16 +108,15 @@ class RunInputs:
 def content_sha256(path: Path) -> str:
     """SHA-256 of a file, or of the names and contents of the pictures in a folder, in hex.
 
-    Of a folder without pictures it is that of its texts, which are labels.
-
-    Raises SourceError where one can't be read.
+    For a folder without pictures, of its texts, which are labels. Raises SourceError if a file
+    can't be read.
     """
     try:
         if not path.is_dir():
             return sha256_of(path)
         files = [*path.iterdir()]
         pictures = [file for file in files if file.suffix.lower() in PICTURE_SUFFIXES]
-        return sha256_of_files(pictures or [one for one in files if one.suffix == ".txt"])
+        return sha256_of_files(pictures or [file for file in files if file.suffix == ".txt"])
     except OSError as error:
         raise SourceError(
             f"{error.filename}: expected a file that can be read, got: {error.strerror}"
@@ -128,8 +127,8 @@ def content_sha256(path: Path) -> str:
 def arithmetic_checksum() -> str:
     """CRC-32 of the bits of fixed sums, products, solutions and functions, as hexadecimal digits.
 
-    Where it differs, so may the last bits of results, with equal versions of everything: OpenBLAS
-    for one has other kernels for AVX2 than for AVX-512, and OPENBLAS_CORETYPE overrides its choice.
+    If it differs, so may the last bits of results, even with equal versions of everything: OpenBLAS
+    has other kernels for AVX2 than for AVX-512, and OPENBLAS_CORETYPE overrides its choice.
     """
     values = np.modf(np.arange(1, 145) * np.sqrt(2.0))[0]
     A, b = values.reshape(12, 12), values[:12]
@@ -148,13 +147,13 @@ def arithmetic_checksum() -> str:
 
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
-# Of the metadata: where all of these are the same, so are the bits of all results.
+# Keys of the metadata: if all of these are the same, so are the bits of all results.
 REPRODUCIBLE_BY = ("stream_dmr", "arithmetic", *_LIBRARIES)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, order=True)
 class RunStart:
-    """Where a run in a folder began: with nothing seen, after the numbers of earlier runs there."""
+    """The beginning of a run in a folder: nothing seen yet, after the numbers of earlier runs."""
 
     frames_before: int  # frames of earlier runs have at most this number
     tracks_before: int  # fish of earlier runs have at most this id
@@ -169,7 +168,7 @@ class SecondCamera:
     ids: Mapping[int, int]  # the first camera's fish, by those of the second
 
     def attachments(self) -> dict[str, bytes]:
-        """The attachments of its run by other names, and what is known of both runs."""
+        """The attachments of its run by other names, and the facts about both runs."""
         metadata = self.header.metadata()
         known = {"offset_ns": self.offset_ns, "ids": [*self.ids.items()], "run": metadata}
         parts = {"json": json.dumps(known).encode(), **self.header.attachments()}
@@ -177,7 +176,7 @@ class SecondCamera:
 
     @classmethod
     def from_attachments(cls, attachments: Mapping[str, bytes]) -> "SecondCamera | None":
-        """The inverse of `attachments`; None where there are none of them."""
+        """The inverse of `attachments`; None if there are none of them."""
         parts = {
             name.removeprefix(_SECOND): data
             for name, data in attachments.items()
@@ -203,14 +202,14 @@ class RunHeader:
     template: Template
     candidates: CandidateShapes | None = None  # None: fish have the template's own shape
     calibration: Calibration | None = None
-    calibration_file: bytes = b""  # the user's file as it was; empty where there is none
-    inputs: RunInputs | None = None  # None: recorded before these were
-    runs: tuple[RunStart, ...] = ()  # those that are in it, by their frames; none in old recordings
+    calibration_file: bytes = b""  # the user's file as it was; empty without a calibration
+    inputs: RunInputs | None = None  # None in recordings older than this field
+    runs: tuple[RunStart, ...] = ()  # the runs in it, by their frames; none in old recordings
     second: SecondCamera | None = None
 
     @property
     def known_inputs(self) -> RunInputs | None:
-        """`inputs`, or of an old recording what its command says of them."""
+        """`inputs`, or the inputs in the command of an old recording."""
         return self.inputs or RunInputs.from_command(self.command)
 
     @cached_property
@@ -219,7 +218,7 @@ class RunHeader:
         return _checksum(self.attachments())
 
     def metadata(self) -> dict[str, str]:
-        """The metadata record `run`: the inputs, and the versions of what wrote the recording."""
+        """The metadata record `run`: the inputs, and the versions of the software that wrote it."""
         given = {} if self.inputs is None else self.inputs.metadata()
         if self.runs:  # such as: 0 0, 1400 7
             runs = (f"{run.frames_before} {run.tracks_before}" for run in self.runs)
@@ -240,7 +239,7 @@ class RunHeader:
         }
 
     def attachments(self) -> dict[str, bytes]:
-        """Name -> content. The .pb ones are exact, for replay; the others can be read by people."""
+        """Name -> content. The .pb files are exact, for replay; people can read the others."""
         files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
         if self.candidates is not None:
             files["shapes.pb"] = encode(self.candidates)
@@ -253,7 +252,7 @@ class RunHeader:
     def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
         """The exact inverse of `metadata` and `attachments`.
 
-        Raises KeyError where a part is missing, RecordingError where one is damaged.
+        Raises KeyError if a part is missing, RecordingError if a part is damaged.
         """
         calibration, shapes = attachments.get("calibration.pb"), attachments.get("shapes.pb")
         runs = [run.split() for run in metadata.get("runs", "").split(",") if run]
@@ -281,7 +280,7 @@ def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:
-    """CRC-32 over names and contents: the mcap library checks no attachment when it reads one."""
+    """CRC-32 over names and contents: the mcap library doesn't check attachments when reading."""
     crc32 = 0
     for name, data in sorted(attachments.items()):
         crc32 = zlib.crc32(name.encode() + data, crc32)
@@ -289,7 +288,7 @@ def _checksum(attachments: Mapping[str, bytes]) -> int:
 
 
 def _cpu() -> str:
-    """The processor's name: another one may round the last bits of sines and sums differently."""
+    """The processor's name: another may round the last bits of sines and sums differently."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -28,13 +28,13 @@ class Recording(Protocol):
     """An opened recording: one file, or the segments of one run."""
 
     header: RunHeader
-    metadata: dict[str, str]  # what recorded it, with which versions
+    metadata: dict[str, str]  # the software that recorded it, with versions
     is_thinned: bool  # its pictures and masks were removed to free disk space
     ends_early: bool  # a segment, or cut off by a crash: the run went on after its end
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is lost, one line each; complete once everything was read."""
+        """Losses, one line each; complete once everything was read."""
         ...
 
     def payloads(
@@ -42,10 +42,10 @@ class Recording(Protocol):
     ) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`, in the order in which they were written.
 
-        `of`: SECOND_TOPICS for those of a second camera, of which an older recording has none.
-        Only those of the selected time and, where the recording has an index, of the time in which
-        the selected tracks were seen; `decoded_messages` leaves out the other tracks. Raises
-        RecordingError where the recording is damaged.
+        `of`: SECOND_TOPICS for the messages of a second camera; older recordings have none. Only
+        messages of the selected time and, if the recording has an index, of the time in which the
+        selected tracks were seen; `decoded_messages` leaves out the other tracks. Raises
+        RecordingError if the recording is damaged.
         """
         ...
 
@@ -61,7 +61,7 @@ class Recording(Protocol):
 def open_recordings(paths: Sequence[Path]) -> Recording:
     """One recording of all paths: files, and folders of a run or of its segments.
 
-    Raises RecordingError where one can't be read, or where they are not of the same run.
+    Raises RecordingError if one can't be read, or if they are not of the same run.
     """
     files = [file for path in paths for file in files_of(path)]
     for file in files:
@@ -106,7 +106,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 class _Segments:
-    """Segments of one run, one after the other."""
+    """The segments of a run, in order, as one recording."""
 
     def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
         self._segments = segments
@@ -129,7 +129,8 @@ class _Segments:
     def payloads(
         self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
-        return chain.from_iterable(one.payloads(kinds, selection, of=of) for one in self._segments)
+        parts = (segment.payloads(kinds, selection, of=of) for segment in self._segments)
+        return chain.from_iterable(parts)
 
     def carried_over(self) -> Iterator[bytes]:
         """The frames that the first segment took over: the others continue it."""
@@ -140,22 +141,22 @@ class _Segments:
 
 
 def require_messages(recording: Recording) -> None:
-    """Raise RecordingError where a recording was cut off before its first whole message."""
+    """Raise RecordingError if a recording was cut off before its first whole message."""
     if recording.ends_early and next(recording.payloads([*TOPICS]), None) is None:
         lost = "; ".join(recording.warnings) or "it has none"
         raise RecordingError(f"expected a recording with whole messages, got none: {lost}")
 
 
 def require_selected(recording: Recording, selection: Selection) -> None:
-    """Raise UserError where a recording has no frame of the selected time, or lacks a fish."""
+    """Raise UserError if a recording has no frame of the selected time, or lacks a fish."""
     require_time(recording, selection)
     if selection.tracks is not None:
         fish = messages_of(recording, LocalizedFish, selection)
-        require_tracks(selection, {one.track_id for one in fish})
+        require_tracks(selection, {seen.track_id for seen in fish})
 
 
 def require_time(recording: Recording, selection: Selection) -> None:
-    """Raise UserError where a recording has no frame of the selected time."""
+    """Raise UserError if a recording has no frame of the selected time."""
     if selection.time_ns is None:
         return
     selected = Selection(time_ns=selection.time_ns)
@@ -169,7 +170,7 @@ def require_time(recording: Recording, selection: Selection) -> None:
 
 
 def require_tracks(selection: Selection, known: Collection[int]) -> None:
-    """Raise UserError where a selected fish is not among the `known` ones."""
+    """Raise UserError if a selected fish is not `known`."""
     missing = (selection.tracks or frozenset()) - {*known}
     if missing:
         place = "the recording" if selection.time_ns is None else "the selected time"
@@ -177,7 +178,7 @@ def require_tracks(selection: Selection, known: Collection[int]) -> None:
 
 
 def require_frame(recording: Recording, frame_index: int, selection: Selection) -> None:
-    """Raise UserError where a recording has no frame of this number in the selected time."""
+    """Raise UserError if a recording has no frame of this number in the selected time."""
     found = messages_of(recording, Frame, Selection(time_ns=selection.time_ns))
     frames = [frame.frame_index for frame in found]
     if frame_index not in frames:
@@ -196,7 +197,7 @@ def learnt_shapes(recording: Recording) -> list[LearntShapes]:
 def known_shapes(recording: Recording) -> CandidateShapes | None:
     """All candidates to which `FittedShape.candidate` is an index; None: the template's own shape.
 
-    Raises RecordingError where the recording is damaged.
+    Raises RecordingError if the recording is damaged.
     """
     candidates = recording.header.candidates
     if candidates is not None:
@@ -209,6 +210,6 @@ Table = TypeVar("Table", bound=Settings)
 
 
 def recorded_settings(header: RunHeader, table: str, kind: type[Table]) -> Table:
-    """The table `[table]` of the run's config.toml; defaults where an older run had none."""
+    """The table `[table]` of the run's config.toml; defaults if an older run had none."""
     config = tomllib.loads(header.config_toml)
     return kind.model_validate(config.get(table, {}))

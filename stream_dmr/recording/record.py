@@ -18,8 +18,8 @@ from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, RecordingSettings
 class Record:
     """A message and its encoding, made once for all sinks."""
 
-    message: Message  # as a recording gives it back, but a frame may keep the pixels it came with
-    whole: Message  # with what the recording leaves out: for drawing
+    message: Message  # as read from a recording, but a frame may keep its original pixels
+    whole: Message  # with the parts that the recording leaves out: for drawing
     encoding: Callable[[], bytes]
     is_second: bool = False  # of the second camera of two
 
@@ -35,8 +35,8 @@ class Record:
 def make_record(message: Message, settings: RecordingSettings) -> Record:
     """The record of a message: parts may be left out and pictures may be lossy.
 
-    Where a replay starts from a lossy picture, the run continues from it too. The picture of a
-    frame is only for viewing where crops are kept, since a replay then starts from those.
+    If a replay starts from a lossy picture, the run continues from it too. If crops are kept, the
+    picture of a frame is only for viewing, since a replay then starts from the crops.
     """
     if isinstance(message, Frame):
         return _record_frame(message, settings)
@@ -57,7 +57,7 @@ def make_record(message: Message, settings: RecordingSettings) -> Record:
 
 
 def as_recorded(message: Message, settings: RecordingSettings) -> Message:
-    """The message that a recording gives back: what a replay compares with and continues from."""
+    """The message as read from a recording, which a replay compares with and continues from."""
     return make_record(message, settings).message
 
 
@@ -87,11 +87,11 @@ class Sink(Protocol):
         ...
 
     def write(self, record: Record, /) -> None:
-        """Take one record. Raises OutputError where the disk refuses it."""
+        """Take one record. Raises OutputError if the disk refuses it."""
         ...
 
     def close(self) -> None:
-        """Leave a valid file. Idempotent. Raises OutputError where the disk refuses its end."""
+        """Leave a valid file. Idempotent. Raises OutputError if the disk refuses its end."""
         ...
 
 
@@ -100,7 +100,7 @@ class BufferedSink(Sink, Protocol):
     """A sink that keeps records for a moment and writes them together."""
 
     def flush_due(self) -> None:
-        """Write what was kept long enough. Raises OutputError where the disk refuses it."""
+        """Write records that were kept long enough. Raises OutputError if the disk refuses it."""
         ...
 
 
@@ -131,7 +131,7 @@ class SinkState:
 
 
 class SinkStates:
-    """The state of each output, as those who write it report it. Thread-safe."""
+    """The state of each output, as reported by its writer. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -156,7 +156,7 @@ class SinkStates:
         return [state.problem for state in self.all() if state.is_failing]
 
 
-_MAX_TRACKS = 1000  # that are counted at a time: those that came last; chosen
+_MAX_TRACKS = 1000  # the last tracks, which are counted; chosen
 
 
 class PhotographChooser:
@@ -170,7 +170,7 @@ class PhotographChooser:
         self._inside: dict[int, int] = {}  # crops of each track inside the picture
 
     def takes(self, crop: FishCrop) -> bool:
-        """True for a crop whose picture is to be kept; each crop is asked about once, in order."""
+        """True for a crop whose picture is to be kept; called once for each crop, in order."""
         is_new = crop.track_id not in self._inside
         count = self._inside.setdefault(crop.track_id, 0)
         if len(self._inside) > _MAX_TRACKS:

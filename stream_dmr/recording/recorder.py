@@ -40,7 +40,7 @@ def open_recording_files(
 ) -> list[FileSink]:
     """The file sinks that the settings ask for, the .mcap first.
 
-    Raises OutputError where the disk refuses one, ConfigError where a package is missing.
+    Raises OutputError if the disk refuses one, ConfigError if a package is missing.
     """
     files: list[FileSink] = []
     with ExitStack() as undo:
@@ -71,10 +71,10 @@ def _extra_topics(header: RunHeader, settings: RecordingSettings) -> Iterator[Ex
         yield H264Topic(crf=settings.h264_crf)
 
 
-_MAX_QUEUED = 64  # messages, some six frames; where the disk can't keep up, the run waits
-_MIN_PAUSE_S = 0.05  # between two looks for what is due, whatever `flush_s` says
-# Chosen: an unexpected failure may be expensive to repeat. It is tried again after the first time,
-# each time twice that, and at last the longest.
+_MAX_QUEUED = 64  # messages, some six frames; if the disk can't keep up, the run waits
+_MIN_PAUSE_S = 0.05  # between two checks for due flushes, for any `flush_s`
+# Pauses before a failed sink is tried again, since a failure may be expensive to repeat: the first,
+# doubled each time, and the longest. Chosen.
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 60.0
 
 
@@ -82,7 +82,7 @@ class Recorder:
     """Writes recording.mcap and .rrd, or segments of them, into one folder.
 
     It encodes and writes in a thread of its own, so that measuring does not wait for the disk.
-    Thread-safe; the messages of one stage must come in their order. Raises OutputError where the
+    Thread-safe; the messages of one stage must come in their order. Raises OutputError if the
     folder can't be written to: at once, at the next `write`, or at `close`.
     """
 
@@ -100,14 +100,14 @@ class Recorder:
         in_one_thread: bool = False,
         photographs: bool = False,
     ) -> None:
-        """Open all sinks: `sinks`, which get each record first, then those that `files` opens.
+        """Open all sinks: `sinks`, which get each record first, then the sinks of `files`.
 
         `files` is `open_recording_files` or, for a source without an end, `open_segments`. With
-        `live` the view is served as well, at `live_address`. `on_refusal` is called with what the
-        disk refuses, instead of an exception, and the sink is tried again with the next record;
-        after a failure of any other kind later and later. `states` gets the state of each sink.
-        With `in_one_thread` everything is written in the caller's thread. With `photographs` a few
-        crops of each fish keep their pictures, as JPEG.
+        `live` the view is served as well, at `live_address`. `on_refusal` is called if the disk
+        refuses a record, instead of an exception, and the sink is tried again with the next record;
+        after another kind of failure later and later. `states` gets the state of each sink. With
+        `in_one_thread` everything is written in the caller's thread. With `photographs` a few crops
+        of each fish keep their pictures, as JPEG.
         """
         self.live_address: str | None = None
         self.states = states or SinkStates()
@@ -139,7 +139,7 @@ class Recorder:
         """Record a message and return it as a replay will read it.
 
         The next stage must get the returned message: only then does a replay repeat the run
-        exactly. It has the recording's pixels where pictures are lossy, and lacks what is not
+        exactly. It has the recording's pixels if pictures are lossy, and lacks parts that are not
         recorded; only a frame by reference keeps its own pixels.
         """
         if not self._is_open:
@@ -160,7 +160,7 @@ class Recorder:
         self._raise_failure()
 
     def close(self) -> None:
-        """Write what is queued and close every sink, also where another one fails. Idempotent.
+        """Write the queue and close every sink, even if another sink fails. Idempotent.
 
         Raises the first failure that was not raised yet.
         """
@@ -179,7 +179,7 @@ class Recorder:
         self.close()
 
     def _write_queued(self) -> None:
-        """Write queued records; where none comes, let the sinks flush what they have buffered."""
+        """Write queued records; if none comes, let the sinks flush their buffers."""
         pause_s = max(self._settings.flush_s, _MIN_PAUSE_S)
         while True:
             try:
@@ -201,7 +201,7 @@ class Recorder:
     def _try(self, sink: Sink, write: Callable[[], None]) -> None:
         """Let a sink write; without `on_refusal`, a sink that failed is not tried again.
 
-        The others go on: where there is no room for pictures, there may still be for lengths.
+        The others continue: without room for pictures, there may still be room for lengths.
         """
         if sink in self._failed_sinks or time.monotonic() < self._retry_at_s.get(sink.name, 0.0):
             return

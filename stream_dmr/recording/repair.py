@@ -28,7 +28,7 @@ def rewrite(path: Path, *, note: str, edit: Edit = lambda topic, data: data) -> 
     """Copy the intact records of a file into a file beside it, durably.
 
     A metadata record named `note` marks the copy. Returns its path and its number of messages.
-    Raises OSError where the disk refuses it.
+    Raises OSError if the disk refuses it.
     """
     copy = path.with_name(path.name + REWRITTEN)
     try:
@@ -102,7 +102,7 @@ def is_unfinished(path: Path) -> bool:
 
 
 def repair_file(path: Path, *, left_by: str = "a crash") -> Repair:
-    """Repair one unfinished file; where the disk refuses that, it stays as it is."""
+    """Repair one unfinished file; if the disk refuses that, it stays as it is."""
     try:
         found, outcome = _repair_rrd(path) if path.suffix == ".rrd" else _repair_mcap(path)
     except RecordingError:
@@ -139,7 +139,7 @@ def _repair_mcap(part: Path) -> tuple[Path, str]:
 
 def _repair_rrd(rrd: Path) -> tuple[Path, str]:
     repaired = rrd.with_name(rrd.name + REWRITTEN)
-    if free_bytes(rrd.parent) < rrd.stat().st_size:  # Rerun does not say that the copy had no room
+    if free_bytes(rrd.parent) < rrd.stat().st_size:  # Rerun does not report a copy without room
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     copy_readable_chunks(rrd, repaired)
     if not (repaired.is_file() and is_closed(repaired)):

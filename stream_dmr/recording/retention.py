@@ -27,7 +27,7 @@ _PERIOD_S = 5.0  # chosen: a run writes some 10 MB in that time
 class Retention:
     """Frees space in the folder of a run whenever the disk has less than `free_bytes` left.
 
-    Deleted first are old tables of frames, whose rows the segments have, then the views and the
+    Old tables of frames, whose rows the segments have, are deleted first, then the views and the
     pictures and masks of the oldest segments but for some photographs, then whole segments;
     segments with a track of `flagged()` after all others. Files that are being written are kept.
     """
@@ -59,7 +59,7 @@ class Retention:
     def free_space(self) -> None:
         """Delete until enough is free or nothing is left to delete.
 
-        Raises OSError or OutputError where the disk fails.
+        Raises OSError or OutputError if the disk fails.
         """
         if not self._free_bytes or not self._folder.is_dir():
             return
@@ -76,11 +76,11 @@ class Retention:
 
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S):
-            with suppress(OSError, OutputError):  # measuring goes on
+            with suppress(OSError, OutputError):  # measuring continues
                 self.free_space()
 
     def _steps(self) -> Iterator[str]:
-        """Delete one thing at a time, and yield its name for the notice."""
+        """Delete step by step, and yield the name of each deleted part for the notice."""
         for table in rotated_files(self._folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
         recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
@@ -97,7 +97,7 @@ class Retention:
                 yield from self._remove(stem.with_suffix(".mcap"), "all")
 
     def _facts(self, stem: Path) -> tuple[Collection[int], bool]:
-        """The track ids of a segment, and True where its pictures and masks are gone."""
+        """The track ids of a segment, and True if its pictures and masks are gone."""
         if stem.name not in self._known:
             try:
                 file = McapRecording(stem.with_suffix(".mcap"))

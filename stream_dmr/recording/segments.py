@@ -37,7 +37,7 @@ from stream_dmr.recording.recorder import STEM, open_recording_files
 from stream_dmr.recording.repair import is_unfinished, repair_file
 from stream_dmr.recording.topics import RecordingSettings
 
-_MAX_FRAMES = 4096  # per track, over two minutes at 30 frames/s; of longer tracks the last ones
+_MAX_FRAMES = 4096  # per track, over two minutes at 30 frames/s; the last frames of longer tracks
 
 
 class OpenTracks:
@@ -88,10 +88,10 @@ class UnfinishedFiles:
         self._thread = Thread(target=self._repair)
 
     def add(self, path: Path) -> None:
-        """Keep in mind what a sink left of the file `path`, if anything.
+        """Note the remains of the file `path` that a sink left, if any.
 
-        A name without a file may be that of the next segment, which must not be repaired while it
-        is written.
+        A name without a file may be the next segment's, which must not be repaired while it is
+        written.
         """
         left = (path, path.with_name(path.name + PART))
         self._paths += [file for file in left if os.path.exists(file)]  # False if the disk fails
@@ -102,7 +102,7 @@ class UnfinishedFiles:
             self._thread.start()
 
     def finish(self) -> None:
-        """Repair what is left, and wait for it."""
+        """Repair the remains, and wait for it."""
         if self._thread.is_alive():
             self._thread.join()
         self._repair()
@@ -126,8 +126,8 @@ _NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths
 class SegmentFiles:
     """Opens, writes and closes the files of segments, given as lists of sinks.
 
-    What the disk refuses is said to `on_notice` and `states`, not raised; the unfinished files are
-    repaired once there is room for the next segment. `on_closed` gets each file that is complete.
+    Refusals of the disk are reported to `on_notice` and `states`, not raised; the unfinished files
+    are repaired once there is room for the next segment. `on_closed` gets each complete file.
     """
 
     def __init__(
@@ -149,15 +149,15 @@ class SegmentFiles:
 
     @property
     def is_disk_full(self) -> bool:
-        """True where the space that is left is kept for lengths; a folder that is away has room."""
+        """True if the space left is reserved for lengths; a folder that is away has room."""
         try:
             free = free_bytes(self._out_dir)
-        except OSError:  # open files can still be written to; the next segment says what is wrong
+        except OSError:  # open files can still be written to; the next segment reports the problem
             return False
         return free < _MIN_FREE_SHARE * self.settings.keep_free_gb * 1e9
 
     def open_next(self) -> list[FileSink]:
-        """The sinks of the next segment; none where the disk refuses them."""
+        """The sinks of the next segment; none if the disk refuses them."""
         if self.is_disk_full:
             self.refuse_for_room()
             return []
@@ -228,7 +228,7 @@ class SegmentFiles:
 
 
 def last_segment_number(out_dir: Path) -> int:
-    """The highest number of a segment in a folder, whole or not; 0 where there are none."""
+    """The highest number of a segment in a folder, whole or not; 0 if there are none."""
     found = [_NUMBERED.fullmatch(path.name) for path in out_dir.iterdir()]
     return max((int(match[1]) for match in found if match), default=0)
 
@@ -240,11 +240,11 @@ class RotatingSink:
     """Writes recording-000001.mcap and .rrd, recording-000002.mcap and .rrd, ...
 
     A cut lies between two frames. The stages are some frames apart, so two segments are open for a
-    moment: messages of frames after the cut go to the new one, and all of a fish that is first
-    heard of in that moment, since it comes with crops of earlier frames. A segment is complete when
-    the last stage has reached the cut; the frames of open tracks are then carried over to the next.
-    Where the disk refuses a write, `on_notice` gets a line and a new segment is tried; `close` says
-    how many frames are in none.
+    moment: messages of frames after the cut go to the new segment, and so do all messages of a fish
+    that first appears in that moment, since it comes with crops of earlier frames. A segment is
+    complete when the last stage has reached the cut; the frames of open tracks are then carried
+    over to the next. If the disk refuses a write, `on_notice` gets a line and a new segment is
+    tried; `close` reports how many frames are in no segment.
     """
 
     name = "segments"
@@ -256,9 +256,9 @@ class RotatingSink:
         interrupted: Iterable[LocalizedFish],
         learnt: Iterable[LearntShapes],
     ) -> None:
-        """`interrupted`: frames of tracks that an earlier run left open and this one finishes.
+        """`interrupted`: frames of tracks that an earlier run left open and this run finishes.
 
-        `learnt`: what earlier runs learnt of their fish; every segment begins with all of it.
+        `learnt`: shapes that earlier runs learnt; every segment begins with all of them.
         """
         self._files, self._settings = files, files.settings
         self._began_ns: int | None = None  # capture time of the first frame
@@ -268,7 +268,7 @@ class RotatingSink:
         self._cropped, self._new = set[int](), set[int]()  # tracks; first cropped since the cut
         for fish in interrupted:
             self._open_tracks.add(make_record(fish, self._settings))
-        self._learnt = [make_record(one, self._settings) for one in learnt]
+        self._learnt = [make_record(shapes, self._settings) for shapes in learnt]
         self._next: list[FileSink] = []
         self._open = self._open_next()
         self._carry_over_to(self._open)
@@ -308,14 +308,14 @@ class RotatingSink:
         return self._cut_ns is not None and getattr(message, "track_id", None) in self._new
 
     def flush_due(self) -> None:
-        """Write what was kept long enough. Never raises OutputError."""
+        """Write records that were kept long enough. Never raises OutputError."""
         for sinks in (self._open, self._next):
             self._files.each(
                 sinks, lambda sink: sink.flush_due() if isinstance(sink, BufferedSink) else None
             )
 
     def close(self) -> None:
-        """Close what is open, repair what can be. Idempotent."""
+        """Close open files, repair unfinished files if possible. Idempotent."""
         self._complete()
         self._files.close(self._open)
         self._files.finish()
@@ -330,7 +330,7 @@ class RotatingSink:
         """Cut before this frame if it is time; complete the segment before an earlier cut."""
         now_ns = self._files.now_ns = frame.timestamp_ns
         if self._open and self._files.is_disk_full:
-            self._complete()  # and close what is open while there is room for its end
+            self._complete()  # and close open files while there is room for their ends
             self._files.close(self._open)
             self._files.refuse_for_room()
         if self._cut_ns is not None:
@@ -355,9 +355,9 @@ class RotatingSink:
         return sinks
 
     def _complete(self) -> None:
-        """End the segment before the cut, if any, once the last stage has reached that.
+        """End the segment before the cut, if any, once the last stage has reached the cut.
 
-        The next segment has the open tracks on the disk before: one of the two always has them.
+        The next segment has the open tracks on the disk first: one of the two always has them.
         """
         if self._cut_ns is None:
             return
@@ -389,9 +389,9 @@ def open_segments(
     on_closed: Callable[[Path], None] = lambda path: None,
     states: SinkStates | None = None,
 ) -> list[Sink]:
-    """A `RotatingSink`, or nothing where the settings ask for no recording.
+    """A `RotatingSink`, or nothing if the settings ask for no recording.
 
-    `on_closed` gets each file that is complete, `states` the state of the files of each kind.
+    `on_closed` gets each complete file, `states` the state of the files of each kind.
     """
     if not (settings.mcap or settings.rrd):
         return []

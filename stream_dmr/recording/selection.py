@@ -9,7 +9,7 @@ Spans = Mapping[int, tuple[int, int]]
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Messages of a time span, of some tracks, and the frames in which those were seen."""
+    """Messages of a time span and of some tracks, and the frames in which these were seen."""
 
     time_ns: tuple[int, int] | None = None  # capture times: first (included), last (excluded)
     tracks: frozenset[int] | None = None
@@ -29,7 +29,7 @@ class Selection:
 
     @property
     def bounds_ns(self) -> tuple[int | None, int | None]:
-        """First capture time (included) and last one (excluded); None: no bound."""
+        """First capture time (included) and last capture time (excluded); None: no bound."""
         if self.time_ns is None:
             return None, None
         return self.time_ns[0] - self.lead_ns, self.time_ns[1]

@@ -22,7 +22,7 @@ from stream_dmr.settings import Settings
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Topic:
-    """Where the messages of one type lie."""
+    """The paths of the messages of one type."""
 
     message: type[Message]
     topic: str  # in the .mcap
@@ -48,13 +48,13 @@ KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
 FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
 IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
-VESSEL, TRACK = "map/vessel", "map/track"  # where it is; where it has been, once and static
+VESSEL, TRACK = "map/vessel", "map/track"  # its present place; its past way, once and static
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
-SECOND_SCENE = "scene/second"  # of a recording of two cameras: what the second one saw
+SECOND_SCENE = "scene/second"  # view of the second camera in a recording of two
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # cleared by every new frame
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
 # Metadata records of an .mcap: of the run; of one of several segments, with its `number`; of a file
-# that was repaired after a crash; of one whose pictures and masks were removed to free disk space.
+# that was repaired after a crash; of a file whose pictures and masks were removed to free space.
 RUN, SEGMENT, RECOVERED, THINNED = "run", "segment", "recovered", "thinned"
 SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
 KEY_FRAME_NS = 1_000_000_000  # capture time between key frames: a reader seeks back one second
@@ -85,7 +85,7 @@ SECOND_TOPICS: Topics = {
     kind: replace(TOPICS[kind], topic=f"/second{TOPICS[kind].topic}")
     for kind in (Frame, FishCrop, FittedMesh, LocalizedFish)
 }
-"""Where a recording of two cameras has the messages of the second one's run, as this has them."""
+"""Topics of the second camera's messages in a recording of two cameras."""
 
 
 CARRIED_OVER = "/carried/localized"
@@ -115,7 +115,7 @@ def topics_table() -> str:
 
 
 class RecordingSettings(Settings):
-    """What is recorded, and how exactly. `docs/files.md` says what each choice keeps."""
+    """What is recorded, and how exactly. `docs/files.md` explains what each choice keeps."""
 
     mcap: bool = Field(default=True, description="write recording.mcap, the record of truth")
     rrd: bool = Field(default=True, description="write recording.rrd, the view for Rerun")
@@ -181,7 +181,7 @@ class RecordingSettings(Settings):
 
     @property
     def keeps_pictures(self) -> bool:
-        """True where the recording has the frames' pictures, beside those of the .rrd."""
+        """True if the recording has the frames' pictures, beside those of the .rrd."""
         return self.frames != "reference" or self.foxglove
 
     @property
@@ -189,5 +189,5 @@ class RecordingSettings(Settings):
         return self.crops in ("jpeg", "png")
 
     def keeps_photographs(self, *, is_live: bool) -> bool:
-        """True where some crops of each fish are all that will be left to see of it."""
+        """True if some crops of each fish are the only pictures that will be left of it."""
         return is_live and self.crops == "few" and self.frames == "reference"

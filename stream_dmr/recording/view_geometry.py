@@ -1,4 +1,4 @@
-"""Geometry, colours and frame rate of what viewers show."""
+"""Geometry, colours and frame rate of the views."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ class PendingItems(Generic[T]):
         self._items: dict[tuple[int, int], T] = {}
 
     def put(self, fish: FishCrop | FittedMesh, item: T) -> None:
-        """Keep `item`; beyond `MAX_PENDING` the oldest one is dropped."""
+        """Keep `item`; beyond `MAX_PENDING` the oldest item is dropped."""
         self._items[fish.track_id, fish.frame_index] = item
         if len(self._items) > MAX_PENDING:  # a live view misses messages
             del self._items[next(iter(self._items))]
@@ -76,14 +76,14 @@ class MeshRebuilder:
         self._bodies = [Body.from_template(shape) for shape in shapes or [template]]
 
     def with_vertices(self, fit: FittedMesh) -> FittedMesh:
-        """The fit, with vertices computed where it lacks them: the original ones within 1e-12."""
+        """The fit, with computed vertices if it lacks them: within 1e-12 of the originals."""
         shape, report = fit.shape, fit.report
         if shape is None or report is None or shape.vertices is not None:
             return fit
         body = self._bodies[shape.candidate or 0]
         points = deform(body, KINDS[report.deformation], shape.parameters)
         v = body.num_vertices
-        # The recorded keypoints say where the fit stands along the viewing ray of its crop.
+        # The recorded keypoints determine the fit's place along the viewing ray of its crop.
         offset = (shape.keypoints - points[v : v + 3]).mean(axis=0)
         return replace(fit, shape=replace(shape, vertices=points[:v] + offset))
 
@@ -117,9 +117,9 @@ def place_fit(
     """Vertices, keypoints and midline of a fit at its localized place, mm in the camera frame.
 
     Fit and camera frame have the same orientation, so a scale (the ratio of the midlines' arc
-    lengths) and a shift (center keypoint to center keypoint) suffice. Of a fish that two cameras
-    placed, the mesh is bent along their midline. Without millimetres the shape is scaled about the
-    camera to a body length of 1, which leaves its projection unchanged. Vertices are None where the
+    lengths) and a shift (center keypoint to center keypoint) suffice. The mesh of a fish placed by
+    two cameras is bent along their midline. Without millimetres the shape is scaled about the
+    camera to a body length of 1, which leaves its projection unchanged. Vertices are None if the
     shape has none.
     """
     arc, vertices = arc_length(shape.midline), shape.vertices
@@ -143,14 +143,14 @@ def bend_along(
     midline: Float[np.ndarray, "M 3"],
     target: Float[np.ndarray, "N 3"],
 ) -> Float[np.ndarray, "V 3"]:
-    """Vertices around a midline, moved to another one of about the same length.
+    """Vertices around a midline, moved to another midline of about the same length.
 
-    Each goes with the nearest station of its midline, turned as the direction there is.
+    Each vertex moves with the nearest station of its midline, turned like the direction there.
     """
     (old, along), (new, target_along) = _stations(midline), _stations(target)
     nearest = KDTree(old).query(vertices)[1]
     offsets = vertices - old[nearest]
-    # Rodrigues: the least turn of one direction into the other.
+    # Rodrigues: the least turn of each direction into the other.
     axis = np.cross(along, target_along)[nearest]
     cosine = (along * target_along).sum(axis=1)[nearest, None]
     turned = np.cross(axis, offsets)
@@ -197,7 +197,7 @@ def shades(
     u, v = b - a, c - a
     weighted = [u[k] * v[m] - u[m] * v[k] for k, m in ((1, 2), (2, 0), (0, 1))]
     corners = faces.ravel()
-    sums = [np.bincount(corners, np.repeat(one, 3), len(vertices)) for one in weighted]
+    sums = [np.bincount(corners, np.repeat(axis, 3), len(vertices)) for axis in weighted]
     normals = np.stack(sums, axis=1)
     lit = normals @ _LIGHT / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     grey = 255 * (_AMBIENT + (1 - _AMBIENT) * (0.5 + 0.5 * lit))

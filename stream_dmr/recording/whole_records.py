@@ -1,4 +1,4 @@
-"""Recorded messages with what drawing needs beside them, those of a second camera in between."""
+"""Complete recorded messages for drawing, with those of a second camera in between."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -14,8 +14,8 @@ from stream_dmr.recording.view_geometry import MAX_PENDING, MeshRebuilder
 class WholeRecords:
     """Makes records of messages that were recorded before, with pictures and vertices.
 
-    What a second camera recorded comes in between, drawn with the first camera's frame that is the
-    nearest in time. Messages from before the first frame have frame 0, which is not drawn.
+    Messages of a second camera come in between, drawn with the first camera's frame nearest in
+    time. Messages from before the first frame have frame 0, which is not drawn.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class WholeRecords:
         self._shown: dict[int, tuple[int, int]] = {}
 
     def of(self, message: Message, payload: bytes) -> Iterator[Record]:
-        """The record of a message, after those of the second camera that come before it."""
+        """The record of a message, after the second camera's records from before it."""
         whole = message
         if isinstance(message, Frame):
             since_ns = message.timestamp_ns if self._last is None else self._last.timestamp_ns

@@ -67,7 +67,7 @@ class H264Topic:
 def decode_video(samples: Iterable[bytes]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
     """Capture times in ns and BGR pictures of CompressedVideo messages, from the first key frame.
 
-    Raises RecordingError where one can't be decoded.
+    Raises RecordingError if one can't be decoded.
     """
     context = av.CodecContext.create("h264", "r")
     context.thread_count = 1  # with more, pictures come out some frames late

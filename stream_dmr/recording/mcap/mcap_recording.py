@@ -1,4 +1,4 @@
-"""Reads an .mcap, also one whose end is missing.
+"""Read an .mcap, also without its end.
 
 Every byte is covered by a checksum: each chunk has one, and so has the data section as a whole,
 which is why everything is read in file order. A selection is read by the index instead, covered by
@@ -42,7 +42,7 @@ from stream_dmr.recording.topics import (
     Topics,
 )
 
-# What the mcap library raises on damaged bytes; its CRC error is a ValueError.
+# Errors of the mcap library on damaged bytes; its CRC error is a ValueError.
 _DAMAGE_ERRORS = (
     *(McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, ZstdError),
     *(OverflowError, MemoryError, AttributeError, TypeError),
@@ -56,9 +56,9 @@ class McapRecording:
     """One .mcap, as the protocol `Recording` of `open_recording` describes it."""
 
     def __init__(self, path: Path) -> None:
-        """Read the header. Raises RecordingError where not even that can be read.
+        """Read the header. Raises RecordingError if not even that can be read.
 
-        Of a file that a run is writing, and may rename, this is what it holds now.
+        A file that a run is writing, and may rename, is read as far as it is now.
         """
         self.path = path
         self._snapshot: Snapshot | None = None
@@ -69,7 +69,7 @@ class McapRecording:
         self.is_being_written = path.suffix == PART and is_locked(path.parent)
 
     def tracks(self) -> Collection[int]:
-        """The track ids in it, read from the index where it has one."""
+        """The track ids in it, read from the index if it has one."""
         with self._open() as stream:
             if not _is_torn(stream) and _has_index(stream):
                 spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
@@ -85,7 +85,7 @@ class McapRecording:
     def payloads(
         self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """Type and encoding of the messages of `kinds`; a torn file gives those that are whole."""
+        """Type and encoding of the messages of `kinds`; only whole messages of a torn file."""
         topics = {of[kind].topic: kind for kind in kinds}
         for topic, message in self._messages(topics, selection):
             yield topics[topic], message.data
@@ -136,7 +136,7 @@ class McapRecording:
     def _read_header(self) -> RunHeader:
         attachments: dict[str, bytes] = {}
         with self._open() as stream:
-            if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):  # torn ones do begin so
+            if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):  # also of torn files
                 raise RecordingError(
                     "expected a recording (.mcap or .rrd), got a file of another kind; give the "
                     "folder of a run, or the recording in it"
@@ -205,7 +205,7 @@ def is_torn(path: Path) -> bool:
 
 
 def _is_torn(stream: IO[bytes]) -> bool:
-    """True where a file lacks the magic bytes at its end; seeks back to the start."""
+    """True if a file lacks the magic bytes at its end; seeks back to the start."""
     size = stream.seek(0, 2)
     stream.seek(max(size - len(MCAP0_MAGIC), 0))
     end = stream.read()
@@ -234,7 +234,7 @@ def _by_index(
 
 
 def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
-    """The first and last capture time of each track; empty where the file doesn't say."""
+    """The first and last capture time of each track; empty if the file has no such record."""
     summary = reader.get_summary()
     for index in summary.attachment_indexes if summary else ():
         if index.name == SPANS:
@@ -248,7 +248,7 @@ def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
 
 
 def _has_index(stream: IO[bytes]) -> bool:
-    """False where a full disk left no room for the index."""
+    """False if a full disk left no room for the index."""
     footer = _footer(stream)
     stream.seek(0)
     return footer.summary_start > 0

@@ -28,7 +28,7 @@ from stream_dmr.recording.topics import CARRIED_OVER, RUN, SECOND_TOPICS, SEGMEN
 from stream_dmr.version import __version__
 
 PART = ".part"  # suffix of a file that is not closed yet
-_CHUNK_BYTES = 256 * 1024  # on kill -9 chunks of 1 MiB lost some three frames, smaller ones fewer
+_CHUNK_BYTES = 256 * 1024  # on kill -9 chunks of 1 MiB lost some three frames, smaller chunks fewer
 _MEDIA_TYPES = {f".{kind}": f"application/{kind}" for kind in ("toml", "yaml", "json")}
 
 
@@ -50,9 +50,9 @@ class McapSink:
     """Writes every record, with its capture time as the log time.
 
     Flushed by the first record that comes `flush_s` of wall clock after the last flush, and by
-    `flush_due`; a segment also after `flush_s` of capture time, of which more passes while a source
+    `flush_due`; a segment also after `flush_s` of capture time, which passes faster while a source
     catches up. A full disk ends the file: its complete chunks are kept and closed without an index,
-    which readers do without; where there is no room even for that, it stays behind as `.part`.
+    which readers don't need; without room even for that, it stays behind as `.part`.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class McapSink:
         extras: Sequence[ExtraTopics] = (),
         segment_number: int | None = None,
     ) -> None:
-        """`flush_s` in seconds. Raises OutputError where the disk refuses the file."""
+        """`flush_s` in seconds. Raises OutputError if the disk refuses the file."""
         self.path = path
         self._part = path.with_name(path.name + PART)
         if self._part.exists():
@@ -111,7 +111,7 @@ class McapSink:
         return self._file.tell()
 
     def write(self, record: Record) -> None:
-        """Append one record. Raises OutputError where the disk refuses it, and closes the file."""
+        """Append one record. Raises OutputError if the disk refuses it, and closes the file."""
         if self._closed:
             raise ValueError(f"{self.path} is closed")
         timestamp_ns = record.message.timestamp_ns
@@ -131,7 +131,7 @@ class McapSink:
                 self._flush()
 
     def flush_due(self) -> None:
-        """Flush what has waited for `flush_s` though no record came. Raises OutputError."""
+        """Flush records that waited for `flush_s` without another one. Raises OutputError."""
         if self._has_unflushed and not self._closed and time.monotonic_ns() >= self._flush_at_ns:
             with self._closing_on_error():
                 self._flush()
@@ -152,7 +152,7 @@ class McapSink:
             raise self._output_error(error) from error
 
     def close(self) -> None:
-        """Write the index, make the file durable and give it its name. Idempotent. OutputError."""
+        """Write the index, make the file durable and rename it. Idempotent. OutputError."""
         if self._closed:
             return
         whole = self._file.tell()

@@ -14,7 +14,7 @@ from stream_dmr.recording.view_geometry import color
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
 # Depths, points of view and opacity are chosen by eye.
-_PICTURE_DEPTH = 0.25  # where the picture stands before the camera, as a share of the fish's depth
+_PICTURE_DEPTH = 0.25  # of the picture before the camera, as a share of the fish's depth
 NOMINAL_DEPTH = 2.5  # body lengths, without calibration: the fish fills half the picture
 RUN = "run"
 _THIN = rr.Radius.ui_points(1.2)
@@ -79,8 +79,8 @@ class Layout(rrb.Blueprint):
 def blueprint(header: RunHeader) -> Layout:
     """The layout: frame and 3D scene above; length, IoU and the log of events below.
 
-    Without a calibration there are no lengths, so the bending ratio takes their place. Where the
-    run was given positions, there is a map; its ground needs the internet.
+    Without a calibration there are no lengths, so the bending ratio takes their place. With
+    positions there is a map; its ground needs the internet.
     """
     calibration = header.calibration
     has_positions = header.inputs is not None and header.inputs.nmea is not None
@@ -174,7 +174,7 @@ def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
 
 
 def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
-    """Where the camera's axis meets the plane, mm; the plane's origin where it doesn't."""
+    """Where the camera's axis meets the plane, mm; the plane's origin if it doesn't."""
     ray = np.array([[0.0, 0.0, 1.0]])
     depth = calibration.plane.depth_mm(ray)[0]
     if np.isfinite(depth) and depth > 0:

@@ -16,7 +16,7 @@ from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 from stream_dmr.recording.topics import RecordingSettings
 
 _PORT = 9876  # Rerun's default
-_MEMORY = "256MiB"  # of the server, for viewers that connect late; what is older is dropped
+_MEMORY = "256MiB"  # of the server, for viewers that connect late; older messages are dropped
 _MAX_QUEUED = 128  # messages, some ten frames; beyond that messages are not shown
 _SEND_S = 0.2
 _CLOSE_TIMEOUT_S = 2.0  # a viewer that hangs is not waited for any longer
@@ -69,7 +69,7 @@ class LiveView:
 
 
 def _free_port() -> int:
-    """Rerun's default port, or any free one. Raises OutputError where there is none."""
+    """Rerun's default port, or any free port. Raises OutputError if there is none."""
     for port in (_PORT, 0):
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))

@@ -1,7 +1,7 @@
 """Read and copy .rrd files, without Rerun in this process.
 
 An .rrd has no checksums, so each message and each part of the header has a CRC-32 beside it, the
-messages of each type are numbered, and a last row says how many there are.
+messages of each type are numbered, and a last row has their number.
 """
 
 import json
@@ -35,7 +35,7 @@ def rerun_program() -> str:
 
 
 def copy_readable_chunks(rrd: Path, target: Path) -> None:
-    """Write what can be read of an .rrd into `target`, with a footer."""
+    """Write the readable part of an .rrd into `target`, with a footer."""
     command = [rerun_program(), "rrd", "filter", "--continue-on-error", str(rrd), "-o", str(target)]
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -52,7 +52,7 @@ class RrdRecording:
     """One .rrd with `rrd_messages`, in memory; the protocol is `Recording` of `open_recording`."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file. Raises RecordingError where it can't be read or holds no messages."""
+        """Read the file. Raises RecordingError if it can't be read or holds no messages."""
         self.path = path
         self.warnings: list[str] = []
         self._rows = _read_apart(path)
@@ -144,7 +144,7 @@ def _rows_in(path: Path) -> Rows:
 
     rows: Rows = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a missing footer, which `RrdRecording.warnings` tells
+        warnings.simplefilter("ignore")  # of a missing footer, see `RrdRecording.warnings`
         for chunk in RrdReader(str(path)).stream():
             entity = str(chunk.entity_path)
             if entity.startswith("/messages/"):
@@ -157,7 +157,7 @@ def _rows_in(path: Path) -> Rows:
 
 
 def is_closed(path: Path) -> bool:
-    """True where an .rrd has its footer."""
+    """True if an .rrd has its footer."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - 16, 0))
         return _FOOTER_MAGIC in file.read()

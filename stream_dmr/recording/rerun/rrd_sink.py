@@ -33,11 +33,11 @@ def new_stream(sink: Any, header: RunHeader) -> rr.RecordingStream:
 
 
 _HEADER_ENTITY = ["messages", "header"]
-# One for so many of the .mcap, which is the record of truth: what is flushed together is sent in a
-# third of the time, and Rerun keeps some kilobytes of each piece until the file is closed.
+# Flushes of the .mcap, the record of truth, for one of the .rrd: rows flushed together are sent in
+# a third of the time, and Rerun keeps some kilobytes of each piece until the file is closed.
 _MCAP_FLUSHES = 4
-_BEGIN_BYTES = 1 << 18  # chosen: several times what Rerun writes before it is first flushed
-_FLUSH_TIMEOUT_S = 30.0  # chosen: a slow disk is waited for, a hanging one is not
+_BEGIN_BYTES = 1 << 18  # chosen: several times the bytes that Rerun writes before its first flush
+_FLUSH_TIMEOUT_S = 30.0  # chosen: long enough for a slow disk, not for a hanging one
 
 
 class RrdSink:
@@ -73,7 +73,7 @@ class RrdSink:
         return self.path.name
 
     def write(self, record: Record) -> None:
-        """Draw one record. Raises OutputError where the disk refuses it, and closes the file."""
+        """Draw one record. Raises OutputError if the disk refuses it, and closes the file."""
         self._drawing.draw(record)
         if self._with_messages:
             self._drawing.add_payload(record)
@@ -81,22 +81,22 @@ class RrdSink:
             self._flush()
 
     def close(self) -> None:
-        """Write what is buffered and the file's footer. Idempotent. OutputError."""
+        """Write the buffer and the file's footer. Idempotent. OutputError."""
         if self._closed:
             return
         self._closed = True
         try:
             self._drawing.finish()
             if self._with_messages:
-                # The number of messages, by which a reader knows when some are missing.
+                # The number of messages, by which a reader notices missing messages.
                 counts = {f"/{path}": n for path, n in self._drawing.num_payloads.items()}
                 self._log(END.split("/"), json.dumps(self._counts | counts).encode())
             self._flush()
         finally:
             self._rec.disconnect()
             del self._rec, self._drawing
-            # End the threads of disconnected streams that nobody holds any more. Rerun does so only
-            # at the next `rr.init`, which many videos or segments in one process never call.
+            # End the threads of disconnected streams without references. Rerun does so only at the
+            # next `rr.init`, which many videos or segments in one process never call.
             flush_and_cleanup_orphaned_recordings()
 
     def _log(self, path: Sequence[object], data: bytes) -> None:

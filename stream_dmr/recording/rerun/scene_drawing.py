@@ -150,7 +150,7 @@ class SceneDrawing:
         self._factor: int | None = None  # frame pixels per pixel of the view
         self._labels = np.zeros((0, 0), np.uint8)  # masks of one frame
         self._labels_frame = 0
-        self._labelled: FishCrop | None = None  # the last one in it; None: all are drawn
+        self._labelled: FishCrop | None = None  # the last crop in it; None: all are drawn
         self._no_masks = b""
         self._track: list[list[float]] = []  # latitude and longitude of positions so far
         self._track_every, self._num_positions = 1, 0
@@ -208,7 +208,7 @@ class SceneDrawing:
             self._second.send()
 
     def finish(self) -> None:
-        """Draw what is known only at the end: the vessel's track."""
+        """Draw the vessel's track, which is complete only at the end."""
         if len(self._track) > 1:
             track = rr.GeoLineStrings(lat_lon=[self._track], colors=[_TRACK_COLOR])
             self._rec.log(topics.TRACK, track, static=True)
@@ -260,7 +260,7 @@ class SceneDrawing:
         self._mask(strips, crop)
 
     def _mask(self, strips: Sequence[Float[np.ndarray, "_ 2"]], crop: FishCrop) -> None:
-        """Add a mask to those of its frame, which are drawn together."""
+        """Add a mask to the masks of its frame, which are drawn together."""
         if self._labelled is not None and self._labelled.frame_index != crop.frame_index:
             self._draw_masks()
         if self._labelled is None and self._labels_frame != crop.frame_index:

@@ -31,7 +31,7 @@ from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
 from stream_dmr.recording.whole_records import WholeRecords
 
-WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
+WEB_MEMORY = "512MiB"  # of the server; older messages are dropped
 _VIEWER_MEMORY = "4GiB"
 _SETTLE_S, _MAX_SETTLES = 1.0, 15  # a screenshot takes some 5 s; slower machines get 15
 _TERMINAL_COLORS = re.compile(r"\x1b\[[0-9;]*m")
@@ -64,9 +64,10 @@ def serve(rrd: str, *, port: int) -> None:
 
 
 def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
-    """Save what a viewer without a screen shows of `rrd` at one frame.
+    """Save the picture of a viewer without a screen that shows `rrd` at a frame.
 
-    Needs a Vulkan driver; a software one does (Debian: mesa-vulkan-drivers). Takes some 5 seconds.
+    Needs a Vulkan driver, which may be a software driver (Debian: mesa-vulkan-drivers). Takes some
+    5 seconds.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -85,7 +86,7 @@ def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
 
 
 def _go_to(viewer: ViewerClient, frame_index: int) -> None:
-    """Go to a frame as soon as frames are loaded. Raises RecordingError where there are none."""
+    """Go to a frame as soon as frames are loaded. Raises RecordingError if there are none."""
     for _ in range(_MAX_SETTLES):
         try:
             return viewer.set_time("frame", sequence=frame_index, play_state="paused")
@@ -145,10 +146,10 @@ def convert(
 ) -> Sequence[str]:
     """Draw the selected messages of a recording into `rrd`, which can be replayed as well.
 
-    Pictures are those of `source`, and `second_source` of a second camera; without them those that
-    the recording holds. Returns what is lost of the recording, one line each. Raises RecordingError
-    where the recording can't be read, UserError where it has nothing of the selection, SourceError
-    where a picture is not the recorded one, OutputError where `rrd` can't be written.
+    Pictures are those of `source`, and `second_source` of a second camera; without them those in
+    the recording. Returns the recording's losses, one line each. Raises RecordingError if the
+    recording can't be read, UserError if it has nothing of the selection, SourceError if a picture
+    is not the recorded one, OutputError if `rrd` can't be written.
     """
     opened = open_recordings([recording])
     require_messages(opened)
