@@ -41,7 +41,7 @@ def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]
     `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
     background, or a COCO file, whose keypoints are head and tail. Beside ids the largest value of
     the type is unknown, as in a run.
-    Raises AnnotationError where images and masks do not match.
+    Raises AnnotationError if images and masks do not match.
     """
     paths = list_images(images)
     if masks.is_dir() and masks.samefile(images):
@@ -57,7 +57,7 @@ def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """The images of a folder by name, in its order. Raises AnnotationError where it has none."""
+    """The images of a folder by name, in its order. Raises AnnotationError if it has none."""
     if not folder.is_dir():
         raise AnnotationError(f"{folder}: expected a folder of images, found none there")
     files = sorted(folder.iterdir())
@@ -76,7 +76,7 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
             f"{len(missing)}, the first of them {missing[0]}; a mask is named like its image, .png"
         )
     files = {path: masks / f"{path.stem}.png" for path in paths.values()}
-    # Fish that are drawn as 255 alone are fish; beside ids that is what hides them.
+    # If 255 is the only value, it is fish; beside ids it is an object that hides them.
     have_ids = any(_ids(labels).any() for labels in map(_read_labels, files.values()))
     for path, mask in files.items():
         image, labels = read_image(path), _read_labels(mask)
@@ -88,7 +88,7 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
             )
         labels = _ids(labels) if have_ids else labels
         ids = np.unique(labels[labels > 0]).tolist()
-        masks_of_it, unmarked = [labels == one for one in ids], [_ends({})] * len(ids)
+        masks_of_it, unmarked = [labels == value for value in ids], [_ends({})] * len(ids)
         yield AnnotatedImage(path=path, image=image, masks=masks_of_it, ends_px=unmarked)
 
 
@@ -101,7 +101,7 @@ def _read_labels(mask: Path) -> Integer[np.ndarray, "H W"]:
 
 
 def _ids(labels: Integer[np.ndarray, "H W"]) -> Integer[np.ndarray, "H W"]:
-    """Without what is unknown."""
+    """The labels without unknown pixels."""
     return np.where(labels == np.iinfo(labels.dtype).max, 0, labels)
 
 
@@ -109,8 +109,8 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
     pictures, annotations = _parse_coco(file)
     for picture in pictures:
         name = Path(str(picture["file_name"])).name
-        of_it = [one for one in annotations if one.get("image_id") == picture["id"]]
-        found = [one for one in of_it if not one.get("iscrowd")]  # several fish as one
+        of_it = [fish for fish in annotations if fish.get("image_id") == picture["id"]]
+        found = [fish for fish in of_it if not fish.get("iscrowd")]  # several fish as one
         if not found:
             continue
         if name not in paths:
@@ -118,11 +118,11 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
         image = read_image(paths[name])
         masks = [
             decode_coco(
-                image.shape[:2], one["segmentation"], where=f"{file}, annotation {one.get('id')}"
+                image.shape[:2], fish["segmentation"], where=f"{file}, annotation {fish.get('id')}"
             )
-            for one in found
+            for fish in found
         ]
-        ends = [_ends(one) for one in found]
+        ends = [_ends(fish) for fish in found]
         yield AnnotatedImage(path=paths[name], image=image, masks=masks, ends_px=ends)
 
 
@@ -139,8 +139,8 @@ def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
     try:
         content = json.loads(read_text(file, max_bytes=_MAX_BYTES))
         pictures, annotations = content["images"], content["annotations"]
-        pictures = sorted(pictures, key=lambda one: str(one["file_name"]))
-        if all("id" in one for one in pictures) and all("segmentation" in a for a in annotations):
+        pictures = sorted(pictures, key=lambda picture: str(picture["file_name"]))
+        if all("id" in p for p in pictures) and all("segmentation" in a for a in annotations):
             return pictures, annotations
     except OSError as error:
         raise AnnotationError(f"{file}: expected a COCO .json, got: {error.strerror}") from None
@@ -153,7 +153,7 @@ def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """The image, BGR. Raises AnnotationError where it can't be decoded, or is too large for it."""
+    """The image, BGR. Raises AnnotationError if it can't be decoded, or is too large for it."""
     _refuse_huge(path)
     image = _decoded(path, cv2.IMREAD_COLOR)
     if image is None:
@@ -179,7 +179,7 @@ _CUTOUT_PX = 448  # width and height of a cutout: the fish is longer than in a c
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
 _PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
-_VALIDATION_EVERY = 5  # images, of which one is kept for validation
+_VALIDATION_EVERY = 5  # every fifth image is kept for validation
 
 
 class Cutout(NamedTuple):
@@ -190,9 +190,9 @@ class Cutout(NamedTuple):
 
 
 def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cutout]]:
-    """The fish to train on, and those of every fifth image, for validation.
+    """The fish to train on, and the fish of every fifth image, for validation.
 
-    Raises AnnotationError where images and masks do not match, or have too few fish.
+    Raises AnnotationError if images and masks do not match, or have too few fish.
     """
     training: list[Cutout] = []
     validation: list[Cutout] = []
@@ -250,7 +250,7 @@ def draw_annotated_sample(
 def fade_end(
     rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]
 ) -> Float32[np.ndarray, "S S 3"]:
-    """The picture with one end of the fish fading into what is around it."""
+    """The picture with one end of the fish fading into its surroundings."""
     if np.count_nonzero(mask) < _MIN_AREA_PX:
         return picture
     points, center, axes = _points_and_axes(mask)
@@ -259,7 +259,7 @@ def fade_end(
     seen = np.ones(mask.shape, np.float32)
     seen[mask] = draw_fade(rng).seen(place)
     seen = cv2.GaussianBlur(seen, (0, 0), 1.0)[..., None]
-    # What is around, carried on smoothly below the fish, with the grain of another place.
+    # The surroundings, continued smoothly below the fish, with the grain of another place.
     around = 1 - cv2.dilate(mask.astype(np.float32), np.ones((5, 5), np.uint8))[..., None]
     width = (0, 0), len(picture) / 16
     weight = cv2.GaussianBlur(around, *width)[..., None]

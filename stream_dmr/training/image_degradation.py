@@ -1,7 +1,7 @@
 """Random changes of a picture, and the fish and backgrounds that pictures are composed of.
 
 Weather, optics and sensor move no outline; their ranges were chosen by hand. Simulated fish and
-backgrounds are cached in a file, beside them are photographed ones.
+backgrounds are cached in a file, and used beside photographed fish and backgrounds.
 """
 
 from collections.abc import Callable
@@ -47,7 +47,7 @@ def add_weather(rng: np.random.Generator, picture: Picture) -> Picture:
 
 
 def simulate_camera(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, "S S 3"]:
-    """Optics, sensor, processing and compression of a random camera; 40 % are good ones."""
+    """Optics, sensor, processing and compression of a random camera; 40 % are good cameras."""
     is_good = rng.random() < 0.4
     if rng.random() < 0.5:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.4))
@@ -120,13 +120,13 @@ def _cloud(rng: np.random.Generator, size: int, grain: float) -> Float32[np.ndar
     return cv2.resize(rng.random((cells, cells), np.float32), (size, size))
 
 
-_PHOTOGRAPHED_SHARE = 0.4  # of fish, and of backgrounds, where there are any; chosen by hand
+_PHOTOGRAPHED_SHARE = 0.4  # of fish, and of backgrounds, if there are any; chosen by hand
 _BANK_VERSION = 3  # part of the file's name; raised when fish or backgrounds are drawn differently
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PatchBank:
-    """Fish patches and backgrounds; the last ones of each may be photographed."""
+    """Fish patches and backgrounds; the last of each may be photographed."""
 
     # BGR times coverage, and coverage; simulated heads are to the left
     fish: UInt8[np.ndarray, "F P P 4"]
@@ -149,12 +149,12 @@ class PatchBank:
         self, fish: list[FishPatch], backgrounds: list[UInt8[np.ndarray, "B B 3"]]
     ) -> "PatchBank":
         """The bank with these besides; either list may be empty."""
-        ends_px = [self.ends_px, *(one.ends_px[None] for one in fish)]
+        ends_px = [self.ends_px, *(patch.ends_px[None] for patch in fish)]
         return replace(
             self,
-            fish=np.concatenate([self.fish, *(one.bgra[None] for one in fish)]),
+            fish=np.concatenate([self.fish, *(patch.bgra[None] for patch in fish)]),
             ends_px=np.concatenate(ends_px, dtype=np.float32),
-            backgrounds=np.concatenate([self.backgrounds, *(one[None] for one in backgrounds)]),
+            backgrounds=np.concatenate([self.backgrounds, *(more[None] for more in backgrounds)]),
             num_photographed_fish=self.num_photographed_fish + len(fish),
             num_photographed_backgrounds=self.num_photographed_backgrounds + len(backgrounds),
         )
@@ -174,7 +174,7 @@ def make_bank(
 ) -> PatchBank:
     """Draw a bank; `progress` is called after each item (about 20 ms).
 
-    Equal seeds give equal banks.
+    Equal seeds make equal banks.
     """
     bank = PatchBank(
         fish=np.empty((num_fish, PATCH_PX, PATCH_PX, 4), np.uint8),

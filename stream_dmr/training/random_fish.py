@@ -178,7 +178,7 @@ _BASE_COLOURS_BGR = np.array(  # browns, greys, olive, silver, gold, red, blue-g
     np.float32,
 )
 
-# Of the sides, chosen by hand: of yellow and black reef fish the network took one colour only.
+# Share of the sides, chosen by hand: of yellow and black reef fish the network took one colour.
 _TWO_COLOURS_SHARE = 0.08
 
 
@@ -186,15 +186,15 @@ def draw_skin_pair(
     rng: np.random.Generator, *, is_flatfish: bool
 ) -> Float32[np.ndarray, "2 S Y 3"]:
     """Both sides of one fish, BGR: alike for a round fish, dark and pale for most flatfish."""
-    one = _draw_side(rng, is_countershaded=not is_flatfish)
+    first = _draw_side(rng, is_countershaded=not is_flatfish)
     if not is_flatfish:
-        return np.stack([one, one])
+        return np.stack([first, first])
     other = _draw_blind_side(rng) if rng.random() < 0.7 else _draw_side(rng, is_countershaded=False)
-    return np.stack([one, other])
+    return np.stack([first, other])
 
 
 def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[np.ndarray, "S Y 3"]:
-    """One side of a fish; a countershaded one is pale below."""
+    """One side of a fish; a countershaded fish is pale below."""
     s, y = texture_grid(_ALONG, _ACROSS)
     colour = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.6, 1.3)
     colour = colour * rng.uniform(0.8, 1.2, 3)
@@ -281,7 +281,7 @@ def _draw_marks(
 
 
 def _draw_eyes(rng: np.random.Generator, is_round: bool) -> list[tuple[float, float]]:
-    """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
+    """Places (s, y) of the eyes on one side: a single eye of a round fish, both of a flatfish."""
     if is_round:
         return [(rng.uniform(0.06, 0.12), rng.uniform(-0.6, -0.1))]
     first, below = rng.uniform(0.06, 0.1), rng.uniform(0.1, 0.4)
@@ -330,7 +330,7 @@ def _fit_to_patch(posed: PosedShape) -> tuple[Float[np.ndarray, "V 2"], Float[np
 def _shade(
     rng: np.random.Generator, shape: FishShape, posed: PosedShape, pixels: Float[np.ndarray, "V 2"]
 ) -> Float[np.ndarray, "H W 4"]:
-    """BGR colour where there is fish, and coverage (0 or 1), in the oversampled patch."""
+    """BGR colour of the fish's pixels, and coverage (0 or 1), in the oversampled patch."""
     normals = vertex_normals(posed.vertices, shape.faces)
     shade, gloss = _draw_light(rng, normals)
     shade = np.where(shape.is_fin, shade * rng.uniform(0.55, 1.25), shade)

@@ -52,9 +52,9 @@ _TURNS_PX = tuple(px for larger in _LARGER_PX for px in (_SMALL_PX, larger))
 
 
 class SampleDataset(Dataset[TrainingSample]):
-    """`size` random examples, drawn on demand: equal seeds give equal ones, so a run can resume.
+    """`size` random examples, drawn on demand: equal seeds draw equal ones, so a run can resume.
 
-    The pictures of a batch are of one size, in turn those of `_TURNS_PX`.
+    The pictures of a batch have the same size; batches take the sizes of `_TURNS_PX` in turn.
     """
 
     def __init__(self, draw: Draw, *, size: int, batch_size: int, seed: tuple[int, ...]) -> None:
@@ -70,7 +70,7 @@ class SampleDataset(Dataset[TrainingSample]):
 
 
 def load_batches(samples: SampleDataset, *, workers: int) -> DataLoader[TrainingSample]:
-    """Batches in order; an incomplete last one is dropped, unless it is the only one."""
+    """Batches in order; an incomplete last batch is dropped, unless it is the only one."""
     return DataLoader(
         samples,
         batch_size=samples.batch_size,
@@ -146,7 +146,7 @@ _SIDES_PX = (16, 160)  # shortest and longest box; a background has 256 px
 def draw_spot_sample(
     rng: np.random.Generator, bank: PatchBank, *, size_px: int
 ) -> TrainingSample | None:
-    """A crop around a spot of a background, with an empty mask; None where nothing stands out."""
+    """A crop around a spot of a background, with an empty mask; None if nothing stands out."""
     background = bank.draw_background(rng)
     spot = find_spot(rng, background)
     if spot is None:
@@ -169,7 +169,7 @@ def draw_spot_sample(
 def find_spot(
     rng: np.random.Generator, background: UInt8[np.ndarray, "B B 3"]
 ) -> Float[np.ndarray, "4"] | None:
-    """The box of a shape that differs from what is around it, likely a large one; or None."""
+    """The box of a shape that differs from its surroundings, likely a large shape; or None."""
     lab = cv2.cvtColor(background, cv2.COLOR_BGR2LAB).astype(np.float32)
     fine, coarse = (cv2.GaussianBlur(lab, (0, 0), sigma) for sigma in (_FINE_PX, _COARSE_PX))
     contrast = np.linalg.norm(fine - coarse, axis=2)
@@ -190,7 +190,7 @@ _OVERVIEW_PX = 96  # of a coarse rendering of the scene, in which the boxes are 
 _OVERVIEW = np.array([-1.0, -1.0, 1.0, 1.0])  # scene units
 _NO_BOX_SHARE = 0.12  # of the examples: no box, the mask is of all fish
 _NO_FISH_SHARE = 0.10  # of the examples: the box is around no fish, as detectors' boxes may be
-_SPOT_SHARE = 0.45  # of those without a fish: around what stands out in a background
+_SPOT_SHARE = 0.45  # of those without a fish: around a spot that stands out in a background
 _PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
 _MIN_VISIBLE = 0.2  # of the target fish; with less visible the scene is drawn again
 
@@ -238,7 +238,7 @@ def draw_sample(rng: np.random.Generator, size_px: int, *, bank: PatchBank) -> T
 def _visible_box(
     rng: np.random.Generator, bank: PatchBank, scene: TrainingScene, is_part: bool
 ) -> Float[np.ndarray, "4"] | None:
-    """The tight box around the visible part of the target fish; None where that is too little.
+    """The tight box around the visible part of the target fish; None if that is too little.
 
     With `is_part` the box of a part of it.
     """
@@ -277,7 +277,7 @@ def _empty_box(
     if part.sum() < 40 or any((part * layer).sum() > 0.01 * part.sum() for layer in layers):
         return None
     if rng.random() < 0.8:
-        things = (draw_into(one, overview, size=_OVERVIEW_PX)[0] for one in scene.occluders)
+        things = (draw_into(thing, overview, size=_OVERVIEW_PX)[0] for thing in scene.occluders)
         part = part * np.maximum.reduce([*things, np.zeros_like(part)])
     x, y, width, height = cv2.boundingRect((part > 0.2).astype(np.uint8))
     if max(width, height) < 8:

@@ -210,7 +210,7 @@ _SUBPIXEL_BITS = 4  # of OpenCV's `shift`: coordinates in sixteenths of a pixel
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Occluder:
-    """Opaque polygons in tones of one colour, later ones over earlier ones."""
+    """Opaque polygons in tones of one colour, later polygons over earlier ones."""
 
     polygons: list[Float[np.ndarray, "_ 2"]]  # scene units
     tones: list[float]  # factor of the colour, per polygon

@@ -57,15 +57,15 @@ def draw_training_curve(history: Sequence[EpochScores], path: Path) -> None:
     for index, (name, (values, colour)) in enumerate(curves.items()):
         steps = max(len(values) - 1, 1)
         points = [_place(k / steps, v) for k, v in enumerate(values) if v is not None]
-        for one, other in pairwise(points):
-            cv2.line(canvas, one, other, colour, 2)
+        for start, end in pairwise(points):
+            cv2.line(canvas, start, end, colour, 2)
         _write(canvas, name, (_EDGE + 170 * index, 18), colour)
     _write(canvas, f"{history[-1].epoch} epochs", (_WIDTH - 110, _HEIGHT - 12), _TEXT)
     cv2.imwrite(str(path), canvas)
 
 
 def draw_worst_masks(training: UNetTrainer, validation: SampleDataset, path: Path) -> None:
-    """Write the validation pictures of least IoU; green: true outline, red: found one."""
+    """Write the validation pictures of least IoU; green: true outline, red: found outline."""
     ious = training.ious
     worst = np.argsort(ious.numpy())[:_NUM_WORST].tolist()
     samples = {index: validation[index] for index in worst}
@@ -115,17 +115,17 @@ class TrainRequest:
 
     out: Path
     settings: TrainSettings
-    images: Path | None = None  # the user's, given with `masks`; None: simulated ones alone
+    images: Path | None = None  # the user's, given with `masks`; None: simulated images alone
     masks: Path | None = None
     backgrounds: Path | None = None  # photographs without fish, behind simulated and own fish
-    init: Path | None = None  # initial weights; None: the shipped ones with `images`, else random
+    init: Path | None = None  # initial weights; None: shipped weights with `images`, else random
     device: str = "cpu"  # or "cuda"
     resume: bool = False
     command: str = ""  # as typed, for scores.json
 
 
 class TrainObserver:
-    """Receives the progress of a training; this one ignores it."""
+    """Receives the progress of a training; the base class ignores it."""
 
     def patches_drawn(self, num_done: int, num_all: int) -> None:
         """The bank of simulated fish and backgrounds has `num_done` of `num_all` items."""
@@ -140,13 +140,13 @@ class TrainObserver:
 def train_unet(
     request: TrainRequest, *, stop: threading.Event, observer: TrainObserver | None = None
 ) -> EpochScores | None:
-    """Train the U-Net; returns the best scores, None where `stop` was set before any.
+    """Train the U-Net; returns the best scores, None if `stop` was set before any.
 
-    Fine-tuning counts its initial weights as epoch 0, so it never ends with worse ones.
+    Fine-tuning counts its initial weights as epoch 0, so it never ends with worse weights.
 
     After every epoch `request.out` has the best weights as `unet.onnx`, for runs, and as `unet.pt`,
     to train on from; `last.pt` (to resume from), `scores.json`, `curve.png` and `worst.png`. Raises
-    a UserError where an input is wrong, before anything is trained.
+    a UserError if an input is wrong, before anything is trained.
     """
     observer = observer or TrainObserver()
     training = _prepare(request)
@@ -203,7 +203,7 @@ def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw
         return simulated, partial(draw_sample, bank=_bank(request, observer, is_validation=True))
     training, validation = load_fish_cutouts(request.images, request.masks)
     bank = _bank(request, observer).with_photographs(
-        [cutout_patch(one) for one in training],
+        [cutout_patch(cutout) for cutout in training],
         load_backgrounds(request.backgrounds) if request.backgrounds is not None else [],
     )
     share = request.settings.own_share

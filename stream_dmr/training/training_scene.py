@@ -29,12 +29,12 @@ from stream_dmr.training.surroundings import (
 )
 
 # Share of the scenes with a fish that lies close beside the target, along it: chosen by hand.
-# Without any the network took what is between two fish as well.
+# Without any the network took the ground between two fish as well.
 _BESIDE_SHARE = 0.12
 
 
 class Fade(NamedTuple):
-    """How a fish's end is lost in what is behind it, as dark, wet and translucent tails are."""
+    """The fading of a fish's end into its background, as of dark, wet and translucent tails."""
 
     begin: float  # share of the fish's long axis from which on it fades
     least: float  # share of the fish's own light at its very end
@@ -108,10 +108,10 @@ def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
         head_px = bank.ends_px[fish.patch][0]
         if rng.random() < 0.4 and np.isfinite(head_px).all():
             occluders.append(draw_line(rng, fish.to_scene(head_px)))
-    if rng.random() < 0.1:  # fish are laid beside rulers; without any those were taken for fish
+    if rng.random() < 0.1:  # fish lie beside rulers, which the network took for fish without these
         along = target.scene_from_patch[:, 0]
         occluders.append(draw_ruler(rng, float(np.arctan2(along[1], along[0]))))
-    frame = np.array([-9.0, -9.0, 9.0, 9.0])  # edges far off, or one across or close to the target
+    frame = np.array([-9.0, -9.0, 9.0, 9.0])  # edges far off; or an edge across or near the target
     if rng.random() < 0.16:
         edge = rng.integers(4)
         frame[edge] = (-1.0 if edge < 2 else 1.0) * rng.uniform(0.0, 0.6)
@@ -158,14 +158,14 @@ def _draw_fish(
     )
 
 
-# Share of the scenes in which fish cast shadows on what is behind them, chosen by hand: without any
+# Share of the scenes in which fish cast shadows on their background, chosen by hand: without any
 # the network took shadows on steel tables for fish.
 _SHADOW_SHARE = 0.35
-# Share of the fish whose end fades: without any the network cut translucent tails, and dark ones on
-# dark ground.
+# Share of the fish whose end fades: without any the network cut translucent tails, and dark tails
+# on dark ground.
 FADED_SHARE = 0.25
 # Share of the scenes whose backdrop has a colour of the fish: without any the network left out
-# tails as dark as what is behind them.
+# tails as dark as their background.
 _ALIKE_SHARE = 0.15
 _MIN_AREA_SCALE = 0.35  # crop px^2 per patch px^2; below, linear sampling would skip pixels
 
@@ -220,7 +220,7 @@ def render_scene(
 
 @dataclass(frozen=True)
 class CastShadow:
-    """How the fish of a scene cast shadows on what is behind them."""
+    """The shadows that the fish of a scene cast on their background."""
 
     offset_px: Float[np.ndarray, "2"]  # from a fish to its shadow, x, y
     blur_px: float

@@ -77,7 +77,7 @@ def ends_loss(
 
 
 def mask_iou(logits: Float[Tensor, "B S S"], masks: Float[Tensor, "B S S"]) -> Float[Tensor, "B"]:
-    """Intersection over union of each pair of masks, at probability 0.5; 1 where both are empty."""
+    """Intersection over union of each pair of masks, at probability 0.5; 1 if both are empty."""
     found, true = logits > 0, masks > 0.5
     both, either = (found & true).sum(dim=(1, 2)), (found | true).sum(dim=(1, 2))
     return torch.where(either > 0, both / either.clamp(min=1), 1.0)
@@ -86,9 +86,9 @@ def mask_iou(logits: Float[Tensor, "B S S"], masks: Float[Tensor, "B S S"]) -> F
 def ends_are_right(
     logits: Float[Tensor, "B 2 s s"], ends_px: Float[Tensor, "B 2 2"]
 ) -> tuple[Bool[Tensor, "B"], Bool[Tensor, "B"]]:
-    """Per image: true where the found head is nearer to the true head than to the true tail.
+    """Per image: true if the found head is nearer to the true head than to the true tail.
 
-    The second tensor is false where the true ends are unknown.
+    The second tensor is false if the true ends are unknown.
     """
     size = logits.shape[-1]
     peak = logits[:, 0].flatten(1).argmax(dim=1)
@@ -100,7 +100,7 @@ def ends_are_right(
 # Chosen by hand, as usual for networks of this size.
 _AVERAGE_DECAY = 0.995  # highest decay per step of the running average of the weights
 _WARM_UP = 0.04  # fraction of all steps in which the learning rate rises
-_FINE_TUNING_RATE = 0.3  # factor of the learning rate where training starts from weights
+_FINE_TUNING_RATE = 0.3  # factor of the learning rate if training starts from weights
 _WEIGHT_DECAY = 1e-4
 _MAX_GRADIENT_NORM = 5.0
 
@@ -111,9 +111,9 @@ class EpochScores:
 
     epoch: int  # from 1; 0: of the weights that fine-tuning began with
     loss: float | None  # mean over the epoch's training pictures; None for epoch 0
-    iou: float  # mean over the pictures; the best weights are those with the highest
+    iou: float  # mean over the pictures; the best weights have the highest
     iou_p10: float  # 10th percentile over the pictures
-    # Fraction of the fish whose head is found at the head; None where the true ends are unknown.
+    # Fraction of the fish whose head is found at the head; None if the true ends are unknown.
     ends_right: float | None
 
 
@@ -171,7 +171,7 @@ class UNetTrainer:
         return self.history[-1].epoch if self.history else 0
 
     def check_start(self, validation: SampleDataset) -> EpochScores:
-        """Score the weights that fine-tuning begins with, so that no worse ones are kept."""
+        """Score the weights that fine-tuning begins with, so that no worse weights are kept."""
         return self._check_and_keep(validation, epoch=0, loss=None)
 
     def run_epoch(
@@ -182,7 +182,7 @@ class UNetTrainer:
         stop: threading.Event,
         progress: Callable[[int], None],
     ) -> EpochScores | None:
-        """Train for one epoch and validate. None where `stop` was set; then nothing is kept.
+        """Train for one epoch and validate. None if `stop` was set; then nothing is kept.
 
         `progress` is called with the number of crops after each step.
         """
@@ -239,7 +239,7 @@ class UNetTrainer:
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "history": [asdict(one) for one in self.history],
+            "history": [asdict(scores) for scores in self.history],
         }
         with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
             torch.save(state, draft)
