@@ -10,7 +10,7 @@ from stream_dmr.tables import original_cell
 VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
 OUTCOME = "outcome.json"  # in the folder of a video that a batch measured, or tried to
-FAILED_OUTCOME = "outcome-failed.json"  # of a later try, beside the results of an earlier one
+FAILED_OUTCOME = "outcome-failed.json"  # of a later try, beside the results of an earlier try
 TABLE_KINDS = ("fish", "frames")  # tables of the data set
 # Columns of VIDEOS and the fields of an Outcome that they hold.
 OUTCOME_COLUMNS = {
@@ -33,7 +33,7 @@ def unfinished_folder(name: str, out: Path) -> Path:
 
 
 def read_videos(out: Path) -> list[dict[str, str]]:
-    """The rows of videos.csv. Raises OutputError where it is damaged."""
+    """The rows of videos.csv. Raises OutputError if it is damaged."""
     path = out / VIDEOS
     try:
         with path.open(newline="", encoding="utf-8") as file:

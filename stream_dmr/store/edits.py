@@ -1,7 +1,7 @@
-"""Which frames each fish has, after what reviewers added, split and merged.
+"""The frames of each fish after reviewers added, split and merged fish.
 
 The tracks of a run stay as they were recorded. A fish that reviewers made is a list of parts of
-tracks; its length is that of the frames in them, filtered as in a run (`edited_lengths`).
+tracks; its length is filtered from their frames as in a run (`length_of_frames`).
 """
 
 import json
@@ -73,7 +73,7 @@ class TrackPart:
 
 @dataclass(frozen=True, kw_only=True)
 class EditedFish:
-    """A fish whose frames are not those of one recorded track."""
+    """A fish whose frames are not exactly one recorded track."""
 
     kind: str  # the last edit: add, split or merge
     parts: tuple[TrackPart, ...]
@@ -85,10 +85,10 @@ class TrackEdits:
     """The fish that reviewers made."""
 
     fish: Mapping[int, EditedFish] = field(default_factory=dict[int, EditedFish])  # by track id
-    merged: Mapping[int, int] = field(default_factory=dict[int, int])  # fish -> that goes on
+    merged: Mapping[int, int] = field(default_factory=dict[int, int])  # fish -> remaining fish
 
     def parts_of(self, track_id: int) -> tuple[TrackPart, ...]:
-        """The parts of a fish; of one that was not edited its whole track."""
+        """The parts of a fish; its whole track if it was not edited."""
         edited = self.fish.get(track_id)
         return (TrackPart(track_id=track_id),) if edited is None else edited.parts
 
@@ -119,7 +119,7 @@ class TrackEdits:
     def split(
         self, track_id: int, frame_index: int, new_fish: int
     ) -> dict[int, tuple[TrackPart, ...]]:
-        """The parts of a fish before a frame, and those from there on, which are a new fish."""
+        """The parts of a fish before a frame, and the parts from there on, which are a new fish."""
         parts = self.parts_of(track_id)
         before = (part.before(frame_index) for part in parts)
         since = (part.since(frame_index) for part in parts)
@@ -148,7 +148,7 @@ def changed_fish(before: TrackEdits, after: TrackEdits) -> set[int]:
     """The fish that have other frames, that came or that went."""
     fish = before.fish.keys() | after.fish.keys()
     merged = before.merged.keys() ^ after.merged.keys()
-    return merged | {one for one in fish if before.fish.get(one) != after.fish.get(one)}
+    return merged | {number for number in fish if before.fish.get(number) != after.fish.get(number)}
 
 
 Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in order
@@ -161,9 +161,9 @@ def settings_of(recording: Recording) -> SmoothLengthSettings:
 def frames_of_tracks(
     recording: Recording, database: Path, track_ids: Iterable[int], last_frames: Mapping[int, int]
 ) -> Frames:
-    """All frames of some tracks, of those that were added too.
+    """All frames of some tracks, also of added tracks.
 
-    `last_frames` by track: what came after it, under an id that had ended, never counted. Raises
+    `last_frames` by track: later frames, under an id that had ended, never counted. Raises
     RecordingError and OutputError.
     """
     wanted = frozenset(track_ids)
@@ -184,25 +184,25 @@ def frames_of_tracks(
 def frames_of_parts(
     frames: Frames, parts: Iterable[TrackPart], *, fish: int
 ) -> list[LocalizedFish]:
-    """The frames of a fish in their order. Raises UserError where two are of one moment."""
+    """The frames of a fish in their order. Raises UserError if two are of the same moment."""
     chosen = [
-        replace(one, track_id=fish)
+        replace(frame, track_id=fish)
         for part in parts
-        for one in frames[part.track_id]
-        if part.has(one.track_id, one.frame_index)
+        for frame in frames[part.track_id]
+        if part.has(frame.track_id, frame.frame_index)
     ]
-    if len({one.frame_index for one in chosen}) < len(chosen):
+    if len({frame.frame_index for frame in chosen}) < len(chosen):
         raise UserError(
             "verdict: expected two tracks that follow each other, got two that are in view "
             "together; one may be a duplicate of the other"
         )
-    return sorted(chosen, key=lambda one: one.frame_index)
+    return sorted(chosen, key=lambda frame: frame.frame_index)
 
 
 def length_of_frames(
     frames: Sequence[LocalizedFish], settings: SmoothLengthSettings
 ) -> list[LengthEstimate]:
-    """The running estimate after each frame, and the final one at the end."""
+    """The running estimate after each frame, and the final estimate at the end."""
     track = TrackLength(frames[0], settings)
     return [*(track.add(fish) for fish in frames), track.finish()]
 
@@ -217,7 +217,7 @@ def corrected_fish(
     """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
 
     Shape, center and bend stay those of the fit. The gates of quality are left out, since the
-    reviewer has looked; UserError where these points give no length.
+    reviewer has looked; UserError if these points determine no length.
     """
     shape = fit.shape
     if shape is None:
@@ -254,9 +254,9 @@ _STAGES: Mapping[type[Message], str] = {FishCrop: "crop", FittedMesh: "fit", Loc
 
 
 class ReviewedMessages:
-    """Messages of the stages of each fish in each frame; those of `LengthEstimate` are the run's.
+    """Messages of the stages of each fish in each frame; `LengthEstimate`s are the run's.
 
-    Without a database, or where reviewers changed no track, they are those of the recording.
+    Without a database, or if reviewers changed no track, they are those of the recording.
     """
 
     def __init__(
@@ -274,7 +274,7 @@ class ReviewedMessages:
             self._added = read_added_frames(database)
 
     def of(self, kind: type[M]) -> Iterator[M]:
-        """The messages of one kind, in the order of their time."""
+        """The messages of a kind, in the order of their time."""
         return (message for message, _ in self.decoded([kind]) if isinstance(message, kind))
 
     def decoded(self, kinds: Collection[type[Message]]) -> Iterator[tuple[Message, bytes]]:
@@ -283,7 +283,7 @@ class ReviewedMessages:
             yield from decoded_messages(self._recording, kinds, self._selection)
             return
         recorded = decoded_messages(self._recording, kinds, self._by_track())
-        found = merge(recorded, self._of_added(kinds), key=lambda one: one[0].timestamp_ns)
+        found = merge(recorded, self._of_added(kinds), key=lambda entry: entry[0].timestamp_ns)
         for message, payload in found:
             if isinstance(message, FishMessage) and not isinstance(message, LengthEstimate):
                 fish = self.edits.fish_of(message.track_id, message.frame_index)
@@ -292,14 +292,14 @@ class ReviewedMessages:
                 yield message, payload
 
     def estimates(self) -> dict[int, dict[int, LengthEstimate]]:
-        """Of each fish that reviewers made, by frame: the running estimate after it."""
+        """The running estimates of each fish that reviewers made, by frame."""
         frames = defaultdict[int, list[LocalizedFish]](list)
         for message in self.of(LocalizedFish) if self.edits.fish else ():
             if message.track_id in self.edits.fish:
                 frames[message.track_id].append(message)
         settings = settings_of(self._recording)
         return {
-            fish: {one.frame_index: one for one in length_of_frames(of_fish, settings)[:-1]}
+            fish: {each.frame_index: each for each in length_of_frames(of_fish, settings)[:-1]}
             for fish, of_fish in frames.items()
         }
 
@@ -308,14 +308,14 @@ class ReviewedMessages:
         fish = self._selection.tracks
         if fish is None:
             return self._selection
-        parts = (part.track_id for one in fish for part in self.edits.parts_of(one))
+        parts = (part.track_id for number in fish for part in self.edits.parts_of(number))
         return replace(self._selection, tracks=frozenset(parts))
 
     def _of_added(self, kinds: Collection[type[Message]]) -> Iterator[tuple[Message, bytes]]:
         wanted = [(kind, name) for kind, name in _STAGES.items() if kind in kinds]
         standing = {part.track_id for fish in self.edits.fish.values() for part in fish.parts}
-        frames = [one for track, of in self._added.items() if track in standing for one in of]
-        for frame in sorted(frames, key=lambda one: one.frame_index):
+        frames = [frame for track, of in self._added.items() if track in standing for frame in of]
+        for frame in sorted(frames, key=lambda frame: frame.frame_index):
             for kind, name in wanted:
                 payload = getattr(frame, name)
                 message = decode(kind, payload)

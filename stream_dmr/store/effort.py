@@ -1,4 +1,4 @@
-"""How much was watched and measured, by haul: what counts of fish are to be divided by."""
+"""Watched time and measured share by haul, to divide counts of fish by."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ class HaulEffort:
     haul: str
     began_ns: int | None = None  # on the clock of the frames; None: of no event
     ended_ns: int | None = None
-    hours_watched: float = 0.0  # of which there are frames
-    share_measured: float | None = None  # of the frames that came; None: not known
+    hours_watched: float = 0.0  # with frames
+    share_measured: float | None = None  # of the frames that came; None if unknown
     num_fish: int = 0
     num_measured: int = 0  # with a length
     fates: Mapping[str, int] | None = None  # number of fish; None: nobody looked for any's fate
@@ -30,9 +30,9 @@ class HaulEffort:
 def read_effort(
     database: Path, fish: Sequence[Fish], *, span: Haul | None = None
 ) -> list[HaulEffort]:
-    """The effort of each haul of a folder, and of what is outside of them. Raises OutputError.
+    """The effort of each haul of a folder, and of the time between them. Raises OutputError.
 
-    `span`: only what was watched in this time, to the five minutes of a row.
+    `span`: only the watched time in this span, to the five minutes of a row.
     """
     hauls = hauls_of(read_rows(database, HAULS))
     watched = read_rows(database, WATCHED)
@@ -66,19 +66,19 @@ def _effort(
     shares: Sequence[float],
     fish: Sequence[Fish],
 ) -> HaulEffort:
-    """`shares` (one a row of `watched`, 0 to 1): what of each watched time belongs to it."""
+    """`shares` (for each row of `watched`, 0 to 1): the part of each watched time in the haul."""
     parts = list(zip(watched, shares, strict=True))
     frames = sum(row["frames"] * share for row, share in parts)
     lost = sum(row["frames_lost"] * share for row, share in parts)
-    of_haul = [one for one in fish if one.haul == name]
-    has_fates = any(one.fate is not None for one in fish)
+    of_haul = [caught for caught in fish if caught.haul == name]
+    has_fates = any(caught.fate is not None for caught in fish)
     return HaulEffort(
         haul=name,
         hours_watched=sum((_hours(row) * share for row, share in parts), start=0.0),
         share_measured=frames / (frames + lost) if frames + lost else None,
         num_fish=len(of_haul),
-        num_measured=sum(one.length_mm is not None for one in of_haul),
-        fates=Counter(one.fate for one in of_haul if one.fate) if has_fates else None,
+        num_measured=sum(caught.length_mm is not None for caught in of_haul),
+        fates=Counter(caught.fate for caught in of_haul if caught.fate) if has_fates else None,
     )
 
 

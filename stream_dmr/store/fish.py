@@ -51,9 +51,9 @@ from stream_dmr.template.template import load_body_forms
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fish:
-    """A finished fish as measured and reviewed: the reviewer's word comes before the measurement.
+    """A finished fish as measured and reviewed; the review has priority over the measurement.
 
-    Length and species as measured are those of `estimate`.
+    Measured length and species are in `estimate`.
     """
 
     estimate: LengthEstimate
@@ -85,12 +85,12 @@ class Fish:
 
     @property
     def fate(self) -> str | None:
-        """The reviewer's, else that of the zones."""
+        """The reviewer's fate, else that of the zones."""
         return self.estimate.fate if self.review.fate is None else self.review.fate
 
     @property
     def length_mm(self) -> float | None:
-        """The length that a reviewer corrected, else the measured one."""
+        """The length that a reviewer corrected, else the measured length."""
         corrected = self.review.length_mm
         return self.estimate.length_mm if corrected is None else corrected
 
@@ -101,7 +101,7 @@ class Fish:
 
     @property
     def species_code(self) -> str | None:
-        """FAO 3-alpha, in a review also one that the list lacks; a classifier's may be unsure.
+        """FAO 3-alpha code, in a review also codes that the list lacks; a classifier may be unsure.
 
         None if nobody looked, and for a name without a code.
         """
@@ -129,18 +129,18 @@ def database_of(path: Path) -> Path | None:
 
 
 def read_fish(path: Path, recording: Recording, selection: Selection = EVERYTHING) -> list[Fish]:
-    """The fish of a folder from its lengths.db, or from the recording where it has none.
+    """The fish of a folder from its lengths.db, or from the recording if it has none.
 
-    Raises OutputError or RecordingError where they can't be read.
+    Raises OutputError or RecordingError if they can't be read.
     """
     database = database_of(path)
     if database is not None:
         fish = read_stored_fish(database)
         return [
-            one
-            for one in fish
-            if selection.includes(one.estimate)
-            and selection.includes_time(one.estimate.last_timestamp_ns)
+            known
+            for known in fish
+            if selection.includes(known.estimate)
+            and selection.includes_time(known.estimate.last_timestamp_ns)
         ]
     facts, track = run_facts(recording.header), recorded_track(recording)
     return [
@@ -163,7 +163,7 @@ def recorded_track(recording: Recording) -> VesselTrack:
 
 
 def read_stored_fish(database: Path) -> list[Fish]:
-    """All fish of a lengths.db as reviewed: with those that were added, split and merged.
+    """All fish of a lengths.db as reviewed: with added, split and merged fish.
 
     A fish that was merged into another stays, with that decision. Raises OutputError if the file
     is damaged.
@@ -217,7 +217,7 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
 def _with_catch(
     estimate: LengthEstimate, parts: Sequence[TrackPart], known: Sequence[Fish]
 ) -> LengthEstimate:
-    """With the species of the first track, and the fate of the last one unless that goes on."""
+    """With the species of the first track, and the fate of the last track if it ended there."""
     if not known:
         return estimate
     first, last = known[0].estimate, known[-1].estimate
@@ -262,7 +262,7 @@ def _clock_notes(database: Path, runs: Mapping[str, RunFacts]) -> Iterator[str]:
 
 
 def numbers_its_own(folder: Path) -> bool:
-    """True where a run in a folder was given no ids of its fish. Raises OutputError."""
+    """True if a run in a folder was given no ids of its fish. Raises OutputError."""
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)
     texts = [{k: v for k, v in asdict(f).items() if isinstance(v, str)} for f in runs.values()]
@@ -301,9 +301,9 @@ def _run_of(row: Mapping[str, Any]) -> RunFacts:
     return RunFacts(**{f.name: row[f.name] for f in fields(RunFacts) if row[f.name] is not None})
 
 
-def is_same_species(one: str, other: str) -> bool:
-    """True where two texts name one species, by its code, a name, or the template drawn of it."""
-    return _species_named(one) == _species_named(other)
+def is_same_species(name: str, other: str) -> bool:
+    """True if two texts name the same species, by its code, a name, or its template."""
+    return _species_named(name) == _species_named(other)
 
 
 @cache

@@ -52,15 +52,15 @@ class FisheriesSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Derived:
-    """What follows from one length; None where it is not known."""
+    """Values that follow from a length; None if unknown."""
 
     fork_length_mm: float | None = None
     total_length_mm: float | None = None
     standard_length_mm: float | None = None
     precaudal_length_mm: float | None = None
     disc_width_mm: float | None = None
-    conversion_source: str | None = None  # of those that follow from the species' own equations
-    length_cm: int | None = None  # of the length by which the species is measured, see `derive`
+    conversion_source: str | None = None  # of values by the species' own equations
+    length_cm: int | None = None  # the length by which the species is measured, see `derive`
     weight_kg: float | None = None
     is_legal_size: bool | None = None
 
@@ -73,12 +73,12 @@ def derive(
     species: str | None = None,
     listed: Species | None = None,
 ) -> Derived:
-    """All that follows from the length from snout to tail keypoint, in mm.
+    """All values that follow from the length from snout to tail keypoint, in mm.
 
-    The template says which length its tail keypoint ends, without which none is known; the others
-    see `all_lengths`. Whole centimetres are those of the length as it is measured. Weight and legal
-    size are for the settings' species alone; `species`: the fish's, where it is not the template's;
-    `listed`: the same, where the bundled list has it.
+    The template defines which length ends at its tail keypoint; without it none is known. For the
+    others see `all_lengths`. Whole centimetres are of the length by which the species is measured.
+    Weight and legal size are for the settings' species alone; `species`: the fish's, if it is not
+    the template's; `listed`: the same, if the bundled list has it.
     """
     if length_mm is None:
         return Derived()
@@ -115,10 +115,10 @@ def whole_cm(length_mm: float, rounding: str) -> int:
 def all_lengths(
     length_mm: float, template: Template, species: Species | None
 ) -> dict[str, tuple[float, str]]:
-    """Each of LENGTHS that is known, and the source of the species' equation it follows from.
+    """The known ones of LENGTHS, each with the source of the species' equation it follows from.
 
-    The source is "" for the length that was measured, and for the fork or total length by the
-    template's ratio, which counts where the species has no equation of its own.
+    The source is "" for the measured length, and for the fork or total length by the template's
+    ratio, which counts if the species has no equation of its own.
     """
     given, factor = template.tail_gives, template.total_per_fork
     if given is None:

@@ -1,7 +1,7 @@
-"""Device keys (Ed25519), and the chain of signed entries over what a device wrote.
+"""Device keys (Ed25519), and the chain of signed entries over a device's results.
 
-Each entry holds a number, the hash of the entry before it, and the hash of one thing: a fish, an
-event, a run or a file. So nothing can be changed, removed, put in or moved without the key.
+Each entry holds a number, the hash of the entry before it, and the hash of a fish, an event, a run
+or a file. So nothing can be changed, removed, put in or moved without the key.
 """
 
 import json
@@ -24,8 +24,8 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.files import read_small
 from stream_dmr.store.schema import CHECKS, LEDGER, Statement, insertion, records
 
-# Kinds of entries beside those of tables: END and STATE (see `read_state`) at the end of a run. A
-# file that was FOUND lay there when a run started, after a crash or renamed.
+# Kinds of entries beside the kinds of tables: END and STATE (see `read_state`) at the end of a run.
+# A FOUND file was in the folder when a run started, after a crash or renamed.
 END, STATE, FILE, FOUND, REMOVED = "end", "state", "file", "found", "removed"
 FILE_KINDS = (FILE, FOUND, REMOVED)
 SIGNATURE_BYTES = 64  # of Ed25519
@@ -50,11 +50,11 @@ class ChainEntry:
 
     @property
     def sha256(self) -> str:
-        """Of the whole entry, for the one after it."""
+        """Hash of the whole entry, for the next entry."""
         return sha256(_canonical(asdict(self))).hexdigest()
 
     def is_signed_by(self, key: Ed25519PublicKey) -> bool:
-        """True where the signature is this key's, and of this entry."""
+        """True if the signature is this key's, and of this entry."""
         try:
             return is_signature(key, b64decode(self.signature), self.signed_bytes)
         except ValueError:
@@ -64,12 +64,12 @@ class ChainEntry:
 class Signer:
     """Continues the chain of a lengths.db with a device's private key, each entry after the last.
 
-    `row` and `content` return the statements, for the transaction of what they sign. Without a key
+    `row` and `content` return statements for the transaction of the signed rows. Without a key
     there are none.
     """
 
     def __init__(self, key_file: Path | None) -> None:
-        """Raises UserError where the file is no private key, or others may read it."""
+        """Raises UserError if the file is no private key, or others may read it."""
         self._key = None if key_file is None else _load_private_key(key_file)
         self._last: ChainEntry | None = None
 
@@ -123,14 +123,14 @@ def lines_sha256(lines: Iterable[str]) -> str:
 
 
 def content_sha256(values: Mapping[str, object]) -> str:
-    """SHA-256 of a row: its columns by name, without those that have no value."""
+    """SHA-256 of a row: its columns by name, without columns that have no value."""
     return sha256(_canonical({k: v for k, v in values.items() if v is not None})).hexdigest()
 
 
 def make_key(path: Path) -> Path:
     """Write a private key that only its owner can read, and `path`.pub; returns the latter.
 
-    Raises OutputError where one of them exists or can't be written.
+    Raises OutputError if one of them exists or can't be written.
     """
     key, public = Ed25519PrivateKey.generate(), path.with_name(f"{path.name}.pub")
     private = key.private_bytes(
@@ -155,7 +155,7 @@ def make_key(path: Path) -> Path:
 
 
 def load_public_key(path: Path) -> Ed25519PublicKey:
-    """The public key of a device. Raises UserError where it is none."""
+    """The public key of a device. Raises UserError if it is none."""
     try:
         key = serialization.load_pem_public_key(read_small(path))
     except (OSError, ValueError) as error:
@@ -195,7 +195,7 @@ def _canonical(values: Mapping[str, object]) -> bytes:
 
 
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
-    """All entries in their order; none where nothing was signed."""
+    """All entries in their order; none if nothing was signed."""
     return records(database, LEDGER, ChainEntry)
 
 

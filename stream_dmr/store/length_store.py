@@ -1,7 +1,7 @@
 """LengthStore: writes every finished fish into lengths.db, durable the moment its track ends.
 
-The database also holds what a restart must not use again: track ids, frame numbers and capture
-times.
+The database also holds the track ids, frame numbers and capture times that a restart must not use
+again.
 """
 
 import json
@@ -57,8 +57,8 @@ from stream_dmr.store.schema import (
 class WaitingRows:
     """Statements for a lengths.db, in order, and its connection. Not thread-safe.
 
-    What the disk refuses stays in memory and is tried again with everything that follows; meanwhile
-    a copy of the file in memory answers questions.
+    Statements that the disk refuses stay in memory and are tried again with all later ones;
+    meanwhile a copy of the file in memory answers queries.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class WaitingRows:
         waits_for_disk: bool,
         state: Callable[[], Iterable[Statement]],
     ) -> None:
-        """`state` is what every commit writes as well, as it is at that moment.
+        """`state` returns statements that every commit adds, as they are at that moment.
 
-        Raises OutputError where the file can't be used; with `waits_for_disk` only where that is
-        not for the disk.
+        Raises OutputError if the file can't be used; with `waits_for_disk` only if the disk is not
+        the reason.
         """
         self._path, self._reserve, self._state = path, reserve, state
         self.pending: list[Statement] = []
@@ -83,7 +83,7 @@ class WaitingRows:
         self._written = _num_written(self.database)
 
     def write(self, *statements: Statement) -> None:
-        """Commit all that waits, and these; where that fails, with the reserved space once more."""
+        """Commit waiting statements and these; if that fails, again with the reserved space."""
         self.pending += statements
         for is_last in (False, True):
             try:
@@ -100,7 +100,7 @@ class WaitingRows:
 
     @property
     def is_in_place(self) -> bool:
-        """False where the file that is open was renamed, deleted or replaced."""
+        """False if the open file was renamed, deleted or replaced."""
         if self._opened is None or not self.is_reached:
             return True
         try:
@@ -109,7 +109,7 @@ class WaitingRows:
             return False
 
     def close(self) -> None:
-        """Close the file; what still waits is lost."""
+        """Close the file; statements that still wait are lost."""
         with suppress(sqlite3.Error):
             self.database.close()
 
@@ -169,7 +169,7 @@ _CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
 
 @dataclass(frozen=True, kw_only=True)
 class Marks:
-    """The last numbers that runs in this folder have used; 0 where there was none."""
+    """The last numbers that runs in this folder have used; 0 if there was none."""
 
     track_id: int = 0
     frame_index: int = 0
@@ -179,7 +179,7 @@ class Marks:
 class LengthStore:
     """The lengths of one output folder, which it locks for this run. Thread-safe.
 
-    A row that the disk refuses stays in memory and is tried again with everything that follows;
+    A row that the disk refuses stays in memory and is tried again with all later rows;
     `trouble` has the reason meanwhile, and `close` raises OutputError if it was never written.
     """
 
@@ -191,10 +191,10 @@ class LengthStore:
         waits_for_disk: bool = False,
         signer: Signer | None = None,
     ) -> None:
-        """Raises OutputError where another run writes there or the file can't be used.
+        """Raises OutputError if another run writes there or the file can't be used.
 
-        With `waits_for_disk`, rows wait in memory from the start where the disk refuses the file.
-        With a `signer`, everything that is written is signed in the same transaction.
+        With `waits_for_disk`, rows wait in memory from the start if the disk refuses the file. With
+        a `signer`, all rows are signed in the transaction that writes them.
         """
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
@@ -226,7 +226,7 @@ class LengthStore:
 
     @property
     def lost(self) -> str:
-        """Why what is written will not be found in the folder; "" while it will."""
+        """The reason why written rows will not be in the folder; "" if they will."""
         if not self._lock_of_folder.is_held:
             return ""
         if not self._lock_of_folder.is_in_place:
@@ -238,7 +238,7 @@ class LengthStore:
     def add(
         self, estimate: LengthEstimate, *, iou: float | None = None, flags: Sequence[str] = ()
     ) -> None:
-        """Write a final estimate durably; `flags`: what a reader of this length must know.
+        """Write a final estimate durably; `flags`: warnings for readers of this length.
 
         `iou`: median over its accepted frames, of mesh and mask.
         """
@@ -269,7 +269,7 @@ class LengthStore:
             self._facts = replace(self._facts, frames_done=(self._facts.frames_done or 0) + 1)
 
     def end(self, ended_by: str, *, promised: int | None = None) -> None:
-        """Say what ended the run, before `close`; `promised`: where that is known only now."""
+        """Write what ended the run, before `close`; `promised`: if that is known only now."""
         promised = self._facts.frames_promised if promised is None else promised
         self._facts = replace(self._facts, ended_by=ended_by, frames_promised=promised)
         last_ns = max(self._used.timestamp_ns, self.last_ns)
@@ -292,20 +292,20 @@ class LengthStore:
         return done, {c["name"]: c["frames_done"] for c in clips if not c["is_done"]}
 
     def clock_behind_s(self) -> float:
-        """By how much this run's start lies before one or the end of an earlier run; else 0."""
+        """By how much this run's start lies before an earlier run's start or end; else 0."""
         runs = list(rows(self._rows.database, RUNS))
-        times = [one[name] or 0 for one in runs for name in ("started_ns", "ended_ns")]
-        began = [one["started_ns"] for one in runs if one["run_id"] == self.run_id]
+        times = [run[name] or 0 for run in runs for name in ("started_ns", "ended_ns")]
+        began = [run["started_ns"] for run in runs if run["run_id"] == self.run_id]
         return (max(times) - began[0]) / 1e9 if began else 0.0
 
     def resume_after_ns(self) -> int:
-        """The capture time after which a live source goes on, whatever the clock was set to."""
+        """The capture time after which a live source continues, for any setting of the clock."""
         mark_ns = self.before.timestamp_ns
         return mark_ns if time.time_ns() > mark_ns else mark_ns + _MARK_EVERY_NS
 
     @property
     def calibration_sha256(self) -> str:
-        """Of the file that this run was given; "" without one."""
+        """SHA-256 of the calibration file; "" without a calibration."""
         return self._facts.calibration_sha256
 
     def scene(self) -> bytes | None:
@@ -328,7 +328,7 @@ class LengthStore:
         return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
-        """Write an event that readers of the lengths must know."""
+        """Write an event, a note to readers of the lengths."""
         self.append(EVENTS, kind, {"kind": kind, "text": text, "timestamp_ns": timestamp_ns})
 
     def append(
@@ -374,7 +374,7 @@ class LengthStore:
             return {i: json.loads(flags) for i, flags in self._rows.database.execute(query)}
 
     def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
-        """The number of finished fish by what stands in a column; not of those without it."""
+        """The number of finished fish by the value of a column, without fish that have none."""
         query = f"SELECT {column}, COUNT(*) FROM fish WHERE {column} NOT NULL GROUP BY {column}"
         with self._lock:
             return dict(self._rows.database.execute(query))
@@ -382,7 +382,7 @@ class LengthStore:
     def close(self) -> None:
         """End the run and leave one file. Idempotent.
 
-        Raises OutputError where rows could not be written, or are not where they should be.
+        Raises OutputError if rows could not be written, or are not in the folder.
         """
         if not self._lock_of_folder.is_held:
             return
@@ -405,7 +405,7 @@ class LengthStore:
             )
 
     def _signed_state(self) -> list[Statement]:
-        """Signs what else the file holds, once all of it is written."""
+        """Statements that sign the rest of the file, once all of it is written."""
         self._rows.write()
         if not self.is_signing or self.trouble:
             return []
@@ -440,7 +440,7 @@ class LengthStore:
             self._rows.write(*statements)
 
     def _state(self) -> Iterator[Statement]:
-        """What every commit writes as it is then: the clip in work, frames done, what is used."""
+        """Statements that every commit adds: the present clip, frames done, used numbers."""
         if self._clip is not None:
             yield _CLIP, (*self._clip, 0)
         yield _COUNTS, (self._facts.frames_done, self._facts.frames_promised, self.run_id)
@@ -449,7 +449,7 @@ class LengthStore:
 
 
 def _marks(database: sqlite3.Connection) -> Marks:
-    """What was used; ids that reviewers gave to added and split fish are used as well."""
+    """The used numbers; ids that reviewers gave to added and split fish are used as well."""
     values = {"track_id": 0} | dict(database.execute("SELECT name, value FROM marks"))
     reviewed = values.pop(REVIEWED_ID, 0)
     values.pop(WRITTEN, None)

@@ -29,10 +29,10 @@ _UNKNOWN = "unknown"
 
 
 def open_results(path: Path, *, template: str = AUTO) -> Recording:
-    """The recording of a run's folder or a recording itself; a `LostRecording` where it is gone.
+    """The recording of a run's folder or a recording itself; a `LostRecording` if it is gone.
 
-    `template`: the run's, as far as is known. Raises RecordingError where there is neither a
-    recording nor a lengths.db.
+    `template`: the run's, if known. Raises RecordingError if there is neither a recording nor a
+    lengths.db.
     """
     database = database_of(path)
     if database is None or _has_recording(path):
@@ -48,10 +48,10 @@ def _has_recording(path: Path) -> bool:
 
 
 class LostRecording:
-    """A recording without messages; its header has what lengths.db knows of the last run."""
+    """A recording without messages; its header has the facts of the last run in lengths.db."""
 
     def __init__(self, database: Path, template: str = AUTO) -> None:
-        """Raises OutputError where the database can't be read."""
+        """Raises OutputError if the database can't be read."""
         facts = [*read_runs(database).values()][-1:]
         self.header = RunHeader(
             source=facts[0].source if facts else _UNKNOWN,
@@ -81,7 +81,7 @@ class LostRecording:
 
 
 def require_recording(recording: Recording, *, where: object, what: str) -> None:
-    """Raise RecordingError where a recording is gone that is needed for `what`."""
+    """Raise RecordingError if a recording that `what` needs is gone."""
     if isinstance(recording, LostRecording):
         raise RecordingError(
             f"{where}: expected a recording for {what}, found no .mcap and no .rrd; lengths.db "
@@ -93,7 +93,7 @@ def require_recording(recording: Recording, *, where: object, what: str) -> None
 def _template_by(hash_hex: str, likely: str) -> Template:
     """The likely or the bundled template with this SHA-256.
 
-    Of another one nothing is known, not even its tail: it stood in the recording alone.
+    Nothing is known of another template, not even its tail: it was only in the recording.
     """
     for name in (likely, AUTO, *bundled_names()):
         template, _ = load_shapes(name)
@@ -121,7 +121,7 @@ def learnt_files(folder: Path) -> list[Path]:
 
 
 def require_free_names(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError where somebody else's file has a name that a learnt mesh would get.
+    """Raise OutputError if a foreign file has a name that a learnt mesh would get.
 
     With `overwrite` it may be replaced.
     """

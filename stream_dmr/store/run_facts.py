@@ -7,7 +7,7 @@ from typing import Any
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.version import __version__
 
-# What `ended_by` says; beside these "an error: ..." with the error's line.
+# Values of `ended_by`; beside these "an error: ..." with the error's line.
 SOURCE_ENDED = "the end of the source"
 SOURCE_CUT_OFF = "the source, which is damaged or cut off there"
 STOPPED = "a stop before the end of the source"
@@ -19,7 +19,7 @@ END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFacts:
-    """The facts of one run, a column of `runs` each. Hashes are SHA-256 in hex; "" for none."""
+    """The facts of one run, a column of `runs` each. Hashes are SHA-256 in hex; "" if missing."""
 
     source: str
     command: str
@@ -41,16 +41,16 @@ class RunFacts:
     vessel: str = ""
     trip: str = ""
     haul: str = ""
-    ended_by: str = ""  # "": an older stream-dmr, which didn't say
+    ended_by: str = ""  # "" by an older stream-dmr
     frames_done: int | None = None  # that went through the whole chain
     frames_promised: int | None = None  # by the source; of a camera: that came; None: unknown
     utc_zero_ns: int | None = None  # added to capture times gives UTC since 1970; None: unknown
 
 
 def cut_short(facts: RunFacts) -> str:
-    """Which share of its source a run measured, and why it ended; "" where that is all of it."""
+    """The share of its source that a run measured, and why it ended; "" if that is all of it."""
     done, promised = facts.frames_done, facts.frames_promised
-    # A container's number of frames, duration x rate, may be one too many.
+    # A container's number of frames, duration x rate, may be 1 too many.
     is_whole = done is None or promised is None or done >= promised - 1
     if not facts.ended_by or (is_whole and facts.ended_by in (SOURCE_ENDED, ENDLESS_STOPPED)):
         return ""

@@ -44,7 +44,7 @@ LENGTHS_COLUMNS = list(column_kinds(FishRow))
 
 
 class LengthsTable:
-    """lengths.csv of a run, while it goes on.
+    """lengths.csv of a run in progress.
 
     It begins (with `resume`) and ends as a whole export of the store, so that no crash loses a row
     of either; meanwhile each finished fish is appended.
@@ -58,10 +58,10 @@ class LengthsTable:
         resume: bool = False,
         on_refusal: Callable[[str], None] | None = None,
     ) -> None:
-        """Raises OutputError where the disk refuses the table.
+        """Raises OutputError if the disk refuses the table.
 
-        With `on_refusal` that gets the reason instead, here and later: a refused row is tried again
-        with the next one, and the whole table at the end and by the next run.
+        With `on_refusal`, this gets the reason instead, here and later: a refused row is tried
+        again with the next row, and the whole table at the end and by the next run.
         """
         self._path, self._store, self._on_refusal = out_dir / "lengths.csv", store, on_refusal
         self.trouble = ""  # why the last row could not be written; "" when all are
@@ -111,7 +111,7 @@ def write_lengths(
 ) -> None:
     """Replace lengths.csv in one step.
 
-    `flags`: of the fish that have some, by track id. Raises OutputError where the disk refuses it.
+    `flags`: of the fish that have some, by track id. Raises OutputError if the disk refuses it.
     """
     with replacing(path) as draft, closing(CsvFile(draft, LENGTHS_COLUMNS)) as table:
         for estimate in estimates:
@@ -176,7 +176,7 @@ _MAX_BYTES = 64 << 20  # of one file of an endless run: some hours of two fish
 class FramesTable:
     """Writes frames.csv; a sink of the recorder.
 
-    A row waits for the running LengthEstimate that follows its LocalizedFish, since only that says
+    A row waits for the running LengthEstimate that follows its LocalizedFish, which alone contains
     whether the frame was used.
     """
 
@@ -192,9 +192,9 @@ class FramesTable:
     ) -> None:
         """With `resume`, the whole rows of an earlier run stay.
 
-        In an endless run a large table is renamed frames-000001.csv and so on, which `on_closed`
-        gets, and a file that the disk refuses is opened with a later row; the rows refused
-        meanwhile are lost here, and are in the recording.
+        In an endless run a large table is renamed frames-000001.csv and so on, and `on_closed` gets
+        its name; a file that the disk refuses is opened with a later row, and the rows refused
+        meanwhile are only in the recording.
         """
         self._table = CsvFile(
             out_dir / self.name,
@@ -207,8 +207,8 @@ class FramesTable:
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}  # by track and frame
 
     def write(self, record: Record) -> None:
-        """Take any record; raises OutputError where the disk refuses a row, or the file is lost."""
-        self._table.require_name()  # also with what is no row, which would pass for one written
+        """Take any record; raises OutputError if the disk refuses a row, or the file is lost."""
+        self._table.require_name()  # also if no row follows, else it would pass for a written row
         message = record.message
         if isinstance(message, LocalizedFish) and not record.is_second:
             self._waiting[message.track_id, message.frame_index] = message

@@ -28,7 +28,7 @@ class ScaleCheck:
 
     @property
     def alarm(self) -> str:
-        """What a reader of lengths must know; "" where the scale is right."""
+        """The warning for readers of lengths; "" if the scale is right."""
         if abs(self.error_percent) <= self.limit_percent:
             return ""
         return (
@@ -40,7 +40,7 @@ class ScaleCheck:
 
 
 class ScaleAlarm:
-    """The alarm of the last check of a calibration, for a run that goes on beside `check`."""
+    """The alarm of the last check of a calibration, for a run that continues beside `check`."""
 
     def __init__(
         self, database: Path, calibration_sha256: str, *, read_every_s: float = _READ_EVERY_S
@@ -50,7 +50,7 @@ class ScaleAlarm:
         self._line, self._read_s = "", -np.inf
 
     def line(self) -> str:
-        """What is wrong with the scale; "" where nothing is, or nothing was checked."""
+        """The problem of the scale; "" if it has none, or nothing was checked."""
         if time.monotonic() - self._read_s >= self._read_every_s:
             self._read_s = time.monotonic()
             with suppress(OutputError):  # a database that can't be read is a problem of its own

@@ -3,7 +3,7 @@
 The file is in SQLite's WAL mode while a run writes to it, so that others may read meanwhile.
 Reading never writes, since archives are kept on write-protected disks.
 
-Marks, clips and scenes say where a run goes on and what it compares with; checks are of the scale.
+Marks, clips and scenes are the state from which a run continues; checks are of the scale.
 """
 
 import json
@@ -26,7 +26,7 @@ from stream_dmr.messages import LengthEstimate
 
 NAME = "lengths.db"
 VERSION = 1  # PRAGMA user_version
-APPLICATION_ID = 0x646D726C  # "dmrl": what `file` and other programs may know it by
+APPLICATION_ID = 0x646D726C  # "dmrl", by which `file` and other programs may recognise it
 _LOCK_TIMEOUT_S = 5.0  # for another program that holds the file; SQLite's own default
 _LOGS = ("-wal", "-journal")  # of SQLite, beside a file that is written to
 _DISK_ERRORS = {
@@ -259,7 +259,7 @@ def refusing(path: Path) -> Generator[None]:
 
 @contextmanager
 def reading(path: Path) -> Generator[sqlite3.Connection]:
-    """A lengths.db, open for reading. Raises OutputError, also if what is read is damaged."""
+    """A lengths.db, open for reading. Raises OutputError, also if it turns out to be damaged."""
     with refusing(path), closing(open_for_reading(path)) as database:
         yield database
 
@@ -296,14 +296,14 @@ def transaction(database: sqlite3.Connection) -> Generator[None]:
 
 
 class DiskRefusal(OutputError):
-    """The disk doesn't let a database be used now; nothing says that it is damaged."""
+    """The disk doesn't let a database be used now; it need not be damaged."""
 
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
-    """Open a lengths.db, making its tables where there are none; usable from any one thread.
+    """Open a lengths.db, making missing tables; usable from any thread, but one at a time.
 
-    Raises OutputError where the file is no such database, damaged, or of a newer version, and
-    DiskRefusal where the disk refuses it.
+    Raises OutputError if the file is no such database, damaged, or of a newer version, and
+    DiskRefusal if the disk refuses it.
     """
     try:
         return _opened(f"{path.absolute().as_uri()}?mode=rwc", path, make_tables=True)
@@ -316,13 +316,13 @@ def open_for_writing(path: Path) -> sqlite3.Connection:
 def open_for_reading(path: Path) -> sqlite3.Connection:
     """Open a lengths.db without writing anything, also beside a run and on a read-only disk.
 
-    Raises OutputError where there is none, or one that is damaged or of a newer version.
+    Raises OutputError if there is none, or if it is damaged or of a newer version.
     """
     if not _size(path):
         raise OutputError(f"{path}: expected a database of lengths, found none; check the path")
     address = path.absolute().as_uri()
     try:
-        if not any(_beside(path, log).exists() for log in _LOGS):  # no run goes on or has crashed
+        if not any(_beside(path, log).exists() for log in _LOGS):  # no run is active or has crashed
             return _opened(f"{address}?mode=ro&immutable=1", path)
         try:
             return _opened(f"{address}?mode=ro", path)
@@ -342,7 +342,7 @@ def copy_database(path: Path, copy: Path) -> None:
 def copy_in_memory(path: Path) -> sqlite3.Connection:
     """A copy to work with while the disk has no room for SQLite's own files; empty without a file.
 
-    Nobody else may have it open. Raises OutputError where it can't be read or is damaged.
+    Nobody else may have it open. Raises OutputError if it can't be read or is damaged.
     """
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
@@ -385,7 +385,7 @@ def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.C
 
 
 def _copy_with_log(path: Path) -> sqlite3.Connection:
-    """A copy in memory of a file with its log, where SQLite can't write beside it."""
+    """A copy in memory of a file with its log, if SQLite can't write beside it."""
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
@@ -409,7 +409,7 @@ def _beside(path: Path, suffix: str) -> Path:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file; 0 where there is none."""
+    """Bytes of a file; 0 if there is none."""
     try:
         return path.stat().st_size
     except FileNotFoundError:
@@ -428,7 +428,7 @@ def _check(database: sqlite3.Connection, path: Path) -> None:
     (problem,) = database.execute("PRAGMA quick_check(1)").fetchone()
     if problem != "ok":
         raise sqlite3.DatabaseError(problem)
-    # A view in place of a table, or a trigger, would change what a reader gets.
+    # A view in place of a table, or a trigger, would change the rows that a reader gets.
     others = database.execute(
         "SELECT type, name FROM sqlite_master WHERE type IN ('view', 'trigger') "
         "OR sql LIKE 'CREATE VIRTUAL%'"
@@ -455,9 +455,9 @@ WRITTEN = "written"
 
 
 def read_state(database: sqlite3.Connection) -> Mapping[str, object]:
-    """Marks, clips and scenes, these by their hashes; a run changes them as it goes on.
+    """Marks, clips and scenes, these by their hashes; a run changes them continually.
 
-    Without the marks of what is written (statements that sign are counted too) and reviewed.
+    Without the marks of written statements (signing statements are counted too) and of reviews.
     """
     marks = [[*row.values()] for row in rows(database, MARKS)]
     return {
@@ -479,13 +479,13 @@ MAY_COUNT_TWICE = "may count twice"
 # A flag of a fish that was in view at a crash: it came into view again, with another number.
 INTERRUPTED = f"{MAY_COUNT_TWICE}: interrupted by a restart, finished with what was recorded"
 CUT_OFF = "cut off"
-# Flags of a fish that was in view at an end that is not that of the source.
+# Flags of a fish that was in view at an end other than the source's.
 CUT_OFF_BY_STOP = f"{CUT_OFF}: in view when the run was stopped"
 CUT_OFF_BY_SOURCE = f"{CUT_OFF}: in view where the source is damaged or cut off"
 
 
 def flags_in_status(flags: Iterable[str]) -> str:
-    """What the tables of fish say of some flags beside the status, such as `; cut off`."""
+    """The text of flags beside the status in tables of fish, such as `; cut off`."""
     shown = [name for name in (MAY_COUNT_TWICE, CUT_OFF) if any(name in flag for flag in flags)]
     return "".join(f"; {name}" for name in shown)
 

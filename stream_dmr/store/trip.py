@@ -19,7 +19,7 @@ class Haul:
 
     name: str
     began_ns: int
-    ended_ns: int | None = None  # None: it goes on
+    ended_ns: int | None = None  # None while it continues
 
     def includes(self, timestamp_ns: int) -> bool:
         return self.began_ns <= timestamp_ns and (
@@ -48,7 +48,7 @@ def haul_at(hauls: Sequence[Haul], timestamp_ns: int) -> str:
 
 
 def next_name(hauls: Iterable[Haul]) -> str:
-    """The number of a haul that nobody gives a name: that after the highest so far."""
+    """The number of a haul without a name: the next after the highest so far."""
     numbers = [int(haul.name) for haul in hauls if haul.name.isdecimal()]
     return str(max(numbers, default=0) + 1)
 
@@ -68,21 +68,21 @@ class KeptPosition:
     longitude: float
     speed_knots: float | None
     course_deg: float | None
-    is_joined: bool  # may be interpolated from the one before
+    is_joined: bool  # may be interpolated from the position before
 
 
 _NAMES = [field.name for field in fields(KeptPosition)]
 
 
 class PositionThinner:
-    """Keeps a position every `keep_s`, and those at both ends of a gap."""
+    """Keeps a position every `keep_s`, and the positions at both ends of a gap."""
 
     def __init__(self, *, keep_s: float, max_gap_s: float) -> None:
         """Positions further apart than `max_gap_s` have a gap between them."""
         self._keep_ns, self._max_gap_ns = round(keep_s * 1e9), round(max_gap_s * 1e9)
-        self._kept: KeptPosition | None = None  # the last one
-        self._last: Position | None = None  # the last one that came
-        self.gap_s = 0.0  # before the last one that came, where that is a gap
+        self._kept: KeptPosition | None = None  # the last kept position
+        self._last: Position | None = None  # the last position that came
+        self.gap_s = 0.0  # before the last position that came, if that is a gap
 
     def take(self, position: Position) -> list[KeptPosition]:
         last, self._last = self._last, position
@@ -102,7 +102,7 @@ class PositionThinner:
         return [self._keep(position, is_joined=True)]
 
     def finish(self) -> list[KeptPosition]:
-        """The last position, where it was not kept."""
+        """The last position, if it was not kept."""
         return [] if self._last is None else self._keep_last(self._last)
 
     def _keep_last(self, last: Position) -> list[KeptPosition]:
@@ -139,13 +139,13 @@ def thinned(positions: Sequence[KeptPosition], *, most: int) -> list[KeptPositio
     step = max(1, -(-len(positions) // most))
     starts = range(0, len(positions), step)
     passed = (positions[max(0, i - step + 1) : i + 1] for i in starts)
-    return [replace(them[-1], is_joined=all(one.is_joined for one in them)) for them in passed]
+    return [replace(step[-1], is_joined=all(each.is_joined for each in step)) for step in passed]
 
 
 def kept_of(
     positions: Iterable[Position], *, keep_s: float, max_gap_s: float
 ) -> Iterator[KeptPosition]:
-    """Those of a recording that a lengths.db would have."""
+    """The positions of a recording that a lengths.db would have."""
     thinner = PositionThinner(keep_s=keep_s, max_gap_s=max_gap_s)
     for position in positions:
         yield from thinner.take(position)
@@ -154,13 +154,13 @@ def kept_of(
 
 @dataclass(frozen=True, kw_only=True)
 class Whereabouts:
-    """Place, speed and time of one moment; None where not known."""
+    """Place, speed and time of one moment; None if unknown."""
 
     utc_ns: int | None = None
     latitude: float | None = None  # degrees, WGS 84
     longitude: float | None = None
     speed_knots: float | None = None
-    gap_s: float | None = None  # between the positions around it, where that is too long
+    gap_s: float | None = None  # between the positions around it, if that is too long
 
 
 NOWHERE = Whereabouts()
@@ -175,7 +175,7 @@ class VesselTrack:
         self._times_ns = [kept.timestamp_ns for kept in self.positions]
 
     def at(self, timestamp_ns: int) -> Whereabouts:
-        """Where the vessel was; linear between two positions, the short way round the earth."""
+        """Place of the vessel; linear between two positions, the short way round the earth."""
         index = bisect_left(self._times_ns, timestamp_ns)
         if index < len(self.positions) and self._times_ns[index] == timestamp_ns:
             kept = self.positions[index]

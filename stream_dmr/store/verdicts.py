@@ -1,9 +1,9 @@
 """Verdicts of reviewers on fish: a log, to which rows are only added (`verdicts_table`).
 
-Measurements stay as they were. The review of a fish is what its verdicts say together: the last
-decision, species, fate, condition and correction; `withdraw` takes back all before it, `undo` one
-verdict. `add`, `split` and `merge` say which frames a fish has (`track_edits`). A blind reading
-changes no review: it is only compared with it.
+Measurements stay as they were. The review of a fish is the sum of its verdicts: the last decision,
+species, fate, condition and correction; `withdraw` takes back all before it, `undo` a single
+verdict. `add`, `split` and `merge` change the frames of a fish (`edits`). A blind reading changes
+no review: it is only compared with it.
 """
 
 import json
@@ -37,7 +37,7 @@ KINDS = (
     *(*DECISIONS[:3], "species", "fate", "condition", "correct", "withdraw"),
     *(*EDITS, "undo"),
 )
-BLIND = "blind"  # the reading of somebody who does not see what others decided
+BLIND = "blind"  # the reading of somebody who does not see the decisions of others
 Ends = tuple[tuple[float, float], tuple[float, float]]  # head and tail, frame pixels
 
 
@@ -59,8 +59,8 @@ class Verdict:
     length_mm: float | None = None
     length_std_mm: float | None = None
     written_ns: int = 0
-    undoes: int | None = None  # number of the verdict that this one takes back, from 1
-    other_fish: int | None = None  # of a split: the new fish; of a merge: the one that goes on
+    undoes: int | None = None  # number of the verdict that this takes back, from 1
+    other_fish: int | None = None  # of a split: the new fish; of a merge: the remaining fish
     fish: str | None = None  # of an edit: the final rows of the fish that it makes, as JSON
     frames_sha256: str | None = None  # of an added fish: of its rows in `added_frames`
     reading: str | None = None  # BLIND, or None
@@ -69,7 +69,7 @@ class Verdict:
 
     @property
     def in_words(self) -> str:
-        """What was decided, for the reviewer."""
+        """The decision in words, for the reviewer."""
         return {
             "accept": "accepted",
             "reject": f"rejected, {self.reason}",
@@ -97,7 +97,7 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Review:
-    """The state of one fish's review; "" and None where no verdict says anything."""
+    """The state of a fish's review; "" and None if no verdict sets a value."""
 
     decision: str = ""  # of DECISIONS
     reason: str = ""
@@ -108,7 +108,7 @@ class Review:
     length_mm: float | None = None  # corrected
     length_std_mm: float | None = None
     moved: Mapping[int, Ends] = field(default_factory=dict[int, Ends])  # corrections, by frame
-    reviewer: str = ""  # the last one
+    reviewer: str = ""  # the last reviewer
     written_ns: int = 0
 
     def after(self, verdict: Verdict) -> "Review":
@@ -152,7 +152,7 @@ def standing(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 
 def blind_readings(verdicts: Sequence[Verdict]) -> dict[str, list[Verdict]]:
-    """What each blind reader said, by name, as verdicts that `reviews_of` counts."""
+    """The readings of each blind reader, by name, as verdicts that `reviews_of` counts."""
     readings: dict[str, list[Verdict]] = {}
     for _, verdict in _not_undone(verdicts):
         if verdict.reading == BLIND:
@@ -163,21 +163,21 @@ def blind_readings(verdicts: Sequence[Verdict]) -> dict[str, list[Verdict]]:
 def last_of(verdicts: Sequence[Verdict], reviewer: str, reading: str | None) -> int | None:
     """Number of the last verdict of a reviewer that was not taken back; None without any."""
     mine = (reviewer, reading)
-    numbers = (n for n, one in _not_undone(verdicts) if (one.reviewer, one.reading) == mine)
+    numbers = (n for n, v in _not_undone(verdicts) if (v.reviewer, v.reading) == mine)
     return max(numbers, default=None)
 
 
 def _not_undone(verdicts: Sequence[Verdict]) -> list[tuple[int, Verdict]]:
-    """The verdicts with their numbers, without `undo` and what it takes back."""
+    """The verdicts with their numbers, without `undo` and the verdicts that it takes back."""
     undone = {verdict.undoes for verdict in verdicts}
     numbered = enumerate(verdicts, start=1)
-    return [(n, one) for n, one in numbered if one.kind != "undo" and n not in undone]
+    return [(n, v) for n, v in numbered if v.kind != "undo" and n not in undone]
 
 
 def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, Review]) -> None:
-    """Raise UserError where a verdict contradicts itself or the reviews so far.
+    """Raise UserError if a verdict contradicts itself or the reviews so far.
 
-    `track_ids`: the fish of the run as reviewed, without those merged into others. Of fish that are
+    `track_ids`: the fish of the run as reviewed, without fish merged into others. Of fish that are
     duplicates of each other, one must remain.
     """
     known = verdict.track_id in track_ids
@@ -204,7 +204,7 @@ def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, R
 
 
 def _originals(verdict: Verdict, reviews: Mapping[int, Review]) -> list[int]:
-    """The fish that this one duplicates, directly and by earlier verdicts, until one repeats."""
+    """The fish that this fish duplicates, directly and by earlier verdicts, until one repeats."""
     originals, track_id = list[int](), verdict.duplicate_of
     while track_id is not None and track_id not in originals:
         originals.append(track_id)
@@ -256,7 +256,7 @@ def add_verdict(
 
     `frames` are those of added fish, `new_fish` is the last track id that they use. With `known`,
     the number of verdicts that they build on, UserError where another reviewer has written
-    meanwhile. Raises OutputError where the disk refuses it.
+    meanwhile. Raises OutputError if the disk refuses it.
     """
     written = [replace(verdict, written_ns=time.time_ns()) for verdict in verdicts]
     try:
