@@ -1,4 +1,4 @@
-"""Fish that a reviewer adds, splits and merges; added ones are measured."""
+"""Fish that a reviewer adds, splits and merges; added fish are measured."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ Boxes = Mapping[int, Float[np.ndarray, "4"]]  # by frame index: x0, y0, x1, y1 i
 
 
 def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
-    """The boxes of all `frame_indices` from the first drawn one to the last.
+    """The boxes of all `frame_indices` from the first drawn box to the last.
 
     Corners move evenly from one drawn box to the next.
     """
@@ -57,15 +57,15 @@ def measure_boxes(
     header: RunHeader,
     config: Config,
 ) -> tuple[list[AddedFrame], list[LocalizedFish], bool]:
-    """Cut out, segment, fit and localize the fish of the boxes, as `run --boxes` does.
+    """Cut out, segment, fit and localize the fish of the boxes, as in `run --boxes`.
 
-    `found` are the frames from the first box to the last. Shapes are those that the run knew or
-    has learnt. Returns the frames to store, the fish in them, and True if they were measured on the
-    very pixels of the run. Raises UserError where there are no pictures.
+    `found` are the frames from the first box to the last. Shapes are those that the run was given
+    or has learnt. Returns the frames to store, the fish in them, and True if they were measured on
+    the very pixels of the run. Raises UserError if there are no pictures.
     """
-    pictures = [one for one in found if one.frame.image.size]
-    boxes = boxes_between(drawn, [one.frame.frame_index for one in pictures])
-    pictures = [one for one in pictures if one.frame.frame_index in boxes]
+    pictures = [shown for shown in found if shown.frame.image.size]
+    boxes = boxes_between(drawn, [shown.frame.frame_index for shown in pictures])
+    pictures = [shown for shown in pictures if shown.frame.frame_index in boxes]
     if not pictures:
         raise UserError(
             "verdict: expected pictures to measure the fish in, but neither the recording nor its "
@@ -85,7 +85,7 @@ def measure_boxes(
         config.crop_fish, camera=setup.camera, finder=AnnotatedFish(boxes=annotated, masks=None)
     )
     session = Session(setup, given=[crop_fish], last="localize")
-    messages = session.messages((one.frame for one in pictures), config.recording)
+    messages = session.messages((shown.frame for shown in pictures), config.recording)
     frames, fish = list[AddedFrame](), list[LocalizedFish]()
     for crop, fit, localized in zip(messages, messages, messages, strict=True):  # of each frame
         assert isinstance(localized, LocalizedFish)
@@ -99,22 +99,22 @@ def measure_boxes(
                 fish=encode(localized),
             )
         )
-    return frames, fish, all(one.is_original for one in pictures)
+    return frames, fish, all(shown.is_original for shown in pictures)
 
 
 class DoubtError(UserError):
-    """A question: an edit contradicts what is measured. Submitted again as `sure`, it is made."""
+    """A question: an edit contradicts measurements. If submitted again as `sure`, it is made."""
 
 
 def require_equal_lengths(measured: Mapping[int, LengthEstimate], merge: Verdict) -> None:
     """DoubtError if the 95 % intervals of two measured fish don't meet."""
     fish = (merge.track_id, merge.other_fish)
-    pair = [measured[one] for one in fish if one is not None and one in measured]
-    intervals = [one.ci95_mm for one in pair if one.ci95_mm is not None]
+    pair = [measured[number] for number in fish if number is not None and number in measured]
+    intervals = [estimate.ci95_mm for estimate in pair if estimate.ci95_mm is not None]
     if len(intervals) == 2 and max(low for low, _ in intervals) > min(top for _, top in intervals):
         lengths = " and ".join(
-            f"{_length_text(one)} ({low / 10:.1f} to {top / 10:.1f})"
-            for one, (low, top) in zip(pair, intervals, strict=True)
+            f"{_length_text(estimate)} ({low / 10:.1f} to {top / 10:.1f})"
+            for estimate, (low, top) in zip(pair, intervals, strict=True)
         )
         raise DoubtError(f"{lengths}: their 95 % intervals don't meet. Are they one fish?")
 
@@ -123,7 +123,7 @@ def _length_text(fish: LengthEstimate) -> str:
     return f"Fish {fish.track_id} is {(fish.length_mm or 0) / 10:.1f} cm"
 
 
-_SAME_FISH = 0.5  # chosen: of two fish side by side, boxes share less than half of what they cover
+_SAME_FISH = 0.5  # IoU; chosen: boxes of two fish side by side share less than half of their area
 
 ADDED = "added by a reviewer"
 OTHER_PIXELS = "measured on pictures of the recording, which are not quite those of the run"
@@ -139,19 +139,19 @@ class TrackEdit:
 
 
 class TrackEditor:
-    """Makes edits of the tracks of one run; nothing is written here."""
+    """Makes edits of the tracks of a run, without writing them."""
 
     def __init__(self, database: Path, pictures: FrameLookup) -> None:
         self._database = database
         self._pictures = pictures
 
     def split(self, report: RunReport, verdict: Verdict) -> TrackEdit:
-        """From `verdict.frame_index` on it is another fish. UserError where that leaves none."""
+        """From `verdict.frame_index` on it is another fish. UserError if a part has no frames."""
         track_id, frame_index = verdict.track_id, verdict.frame_index
         new_fish = self._new_fish()
         if frame_index is None:
             raise UserError("verdict: expected the first frame of the other fish")
-        whole = next(one.estimate for one in report.fish if one.estimate.track_id == track_id)
+        whole = next(fish.estimate for fish in report.fish if fish.estimate.track_id == track_id)
         if not whole.first_frame < frame_index <= whole.last_frame:
             raise UserError(
                 f"verdict: expected a frame after the first of fish {track_id} "
@@ -163,10 +163,10 @@ class TrackEditor:
         return TrackEdit(verdict=made, new_fish=new_fish)
 
     def merge(self, report: RunReport, verdict: Verdict) -> TrackEdit:
-        """`verdict.other_fish` goes on as this one; UserError where both are in view together."""
+        """`verdict.other_fish` becomes part of this fish; UserError if both are in view at once."""
         self._refuse_beside_a_run()
         other = verdict.other_fish
-        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
+        there = {fish.estimate.track_id for fish in report.fish} - report.edits.merged.keys()
         if other is None or other == verdict.track_id or other not in there:
             raise UserError(f"verdict: expected the number of another fish, got {other}")
         rows = self._rows(report, {other: report.edits.merge(verdict.track_id, other)})
@@ -179,7 +179,7 @@ class TrackEditor:
         time_ns: tuple[int, int],
         measured: Mapping[int, LengthEstimate],
     ) -> None:
-        """DoubtError if the boxes lie over one of the `measured` fish."""
+        """DoubtError if the boxes lie over a `measured` fish."""
         selection = Selection(time_ns=(time_ns[0], time_ns[1] + 1))
         for crop in ReviewedMessages(report.recording, self._database, selection).of(FishCrop):
             box = boxes_between(drawn, [crop.frame_index]).get(crop.frame_index)
@@ -221,10 +221,10 @@ class TrackEditor:
     ) -> list[dict[str, Any]]:
         """The final row of each fish."""
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
-        measured = {one.estimate.track_id: one for one in read_measured_fish(self._database)}
-        last = {track_id: one.estimate.last_frame for track_id, one in measured.items()}
+        measured = {fish.estimate.track_id: fish for fish in read_measured_fish(self._database)}
+        last = {track_id: fish.estimate.last_frame for track_id, fish in measured.items()}
         frames = frames_of_tracks(report.recording, self._database, tracks, last)
-        flags = {one.estimate.track_id: one.flags for one in report.fish}
+        flags = {fish.estimate.track_id: fish.flags for fish in report.fish}
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
             chosen = frames_of_parts(frames, of_fish, fish=fish)

@@ -22,7 +22,7 @@ class LabelAgreement:
 
     count: int
     same: int
-    kappa: float | None  # Cohen's; None where both always say one and the same
+    kappa: float | None  # Cohen's; None if both always give the same label
 
     @property
     def text(self) -> str:
@@ -53,7 +53,7 @@ class LengthAgreement:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What one reader said of the fish as they were measured."""
+    """The labels of one reader for the measured fish."""
 
     name: str
     decisions: Mapping[_Fish, str] = field(default_factory=dict[_Fish, str])
@@ -75,16 +75,16 @@ class ReadingPair:
 def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> float | None:
     """Agreement beyond chance: (p_o - p_e) / (1 - p_e).
 
-    p_o is the share of equal labels, p_e the share that readers would have who give their labels by
-    chance, each as often as they did. None without labels or where p_e is 1. Cohen, "A Coefficient
-    of Agreement for Nominal Scales", Educational and Psychological Measurement 20 (1960).
+    p_o is the share of equal labels, p_e the share by chance if each reader gives every label as
+    often as observed. None without labels or if p_e is 1. Cohen, "A Coefficient of Agreement for
+    Nominal Scales", Educational and Psychological Measurement 20 (1960).
     """
     count = len(first)
     if count == 0:
         return None
     observed = sum(a == b for a, b in zip(first, second, strict=True)) / count
-    one, other = Counter(first), Counter(second)
-    expected = sum(one[label] * other[label] for label in one) / count**2
+    counts, other = Counter(first), Counter(second)
+    expected = sum(counts[label] * other[label] for label in counts) / count**2
     return None if expected == 1 else (observed - expected) / (1 - expected)
 
 
@@ -105,16 +105,20 @@ def length_agreement(differences_mm: Sequence[float]) -> LengthAgreement:
 def agreements(folders: Sequence[Path]) -> list[ReadingPair]:
     """Each pair of readings of the fish of some runs: the review, and each blind reading.
 
-    The measurement itself stands beside them with its lengths. Raises UserError where there are no
-    two readings.
+    The measurement itself is beside them with its lengths. Raises UserError if there are no two
+    readings.
     """
-    readings = [one for one in _readings(folders) if one.decisions or one.species or one.lengths_mm]
+    readings = [
+        reading
+        for reading in _readings(folders)
+        if reading.decisions or reading.species or reading.lengths_mm
+    ]
     if len(readings) < 2:
         raise UserError(
             f"{folders[0]}: expected verdicts to compare, found none; take them with stream-dmr "
             "review, and a second reading with --blind"
         )
-    return [_compared(one, other) for one, other in combinations(readings, 2)]
+    return [_compared(first, other) for first, other in combinations(readings, 2)]
 
 
 def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
@@ -125,10 +129,10 @@ def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
         if database is None:
             raise UserError(f"{folder}: expected the --out of a run, found no lengths.db")
         fish = read_measured_fish(database)
-        there = {one.estimate.track_id for one in fish}
-        for one in fish:
-            if one.estimate.length_mm is not None:
-                measured[str(folder), one.estimate.track_id] = one.estimate.length_mm
+        there = {caught.estimate.track_id for caught in fish}
+        for caught in fish:
+            if caught.estimate.length_mm is not None:
+                measured[str(folder), caught.estimate.track_id] = caught.estimate.length_mm
         verdicts = read_verdicts(database)
         said = {REVIEW: verdicts} | blind_readings(verdicts)
         for name, of_reader in said.items():
@@ -159,6 +163,6 @@ def _compared(first: Reading, second: Reading) -> ReadingPair:
 
 def _labels(first: Mapping[_Fish, str], second: Mapping[_Fish, str]) -> LabelAgreement:
     both = [fish for fish in first if fish in second]
-    one, other = [first[fish] for fish in both], [second[fish] for fish in both]
-    same = sum(a == b for a, b in zip(one, other, strict=True))
-    return LabelAgreement(count=len(both), same=same, kappa=cohens_kappa(one, other))
+    labels, other = [first[fish] for fish in both], [second[fish] for fish in both]
+    same = sum(a == b for a, b in zip(labels, other, strict=True))
+    return LabelAgreement(count=len(both), same=same, kappa=cohens_kappa(labels, other))

@@ -36,10 +36,10 @@ class Alert:
 
 
 class AlertSender:
-    """Looks at a run's health in a thread of its own, and sends each change once.
+    """Checks a run's health in a thread of its own, and sends each change once.
 
-    What can't be delivered is noted once and tried again, later and later; only the latest state is
-    sent then.
+    An alert that can't be delivered is noted once and tried again, at growing intervals; then only
+    the latest state is sent.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class AlertSender:
         look_s: float = _LOOK_S,
         first_pause_s: float = _FIRST_PAUSE_S,
     ) -> None:
-        """Raises ConfigError where the settings do not fit together."""
+        """Raises ConfigError if the settings do not fit together."""
         self._deliver = _deliveries(settings)
         self._failing = set[Callable[[Alert], None]]()
         self._run, self._problems, self._on_notice = run, problems, on_notice
@@ -77,7 +77,7 @@ class AlertSender:
                 told = kinds
 
     def _send(self, problems: Sequence[str]) -> bool:
-        """Deliver by every way; False where the health changed or the run ended before."""
+        """Deliver by every way; False if the health changed or the run ended before."""
         alert = Alert(
             run=self._run,
             healthy=not problems,
@@ -109,7 +109,7 @@ class AlertSender:
 
 
 def _kinds(problems: Sequence[str]) -> list[str]:
-    """Problems without their figures, which change from one look to the next."""
+    """Problems without their figures, which change from check to check."""
     return sorted({re.sub(r"\d+", "#", problem) for problem in problems})
 
 
@@ -127,7 +127,7 @@ def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
 
 
 def _post(address: str, alert: Alert) -> None:
-    """POST it as JSON; its `text` is what chat services show."""
+    """POST it as JSON; chat services show its `text`."""
     content = json.dumps(asdict(alert) | {"text": alert.title}).encode()
     request = urllib.request.Request(address, content, {"Content-Type": "application/json"})
     with urllib.request.urlopen(request, timeout=_TIMEOUT_S):

@@ -19,7 +19,7 @@ from stream_dmr.store.fish import database_of
 from stream_dmr.web.report_page import RunReport
 from stream_dmr.web.views import mask_outlines
 
-# Chosen: what leads to a fish and what becomes of it is seen; a fish that stays is seen in parts.
+# Margin before and after a fish, which shows what becomes of it, and the longest clip. Chosen.
 _MARGIN_NS, _MAX_NS = 1_000_000_000, 10_000_000_000
 _MAX_WIDTH_PX = 960  # of a picture that is sent; the page's canvas is no wider
 _JPEG_QUALITY = 80
@@ -28,12 +28,12 @@ _JPEG_QUALITY = 80
 def clip_span_ns(report: RunReport, track_id: int, shift: int) -> tuple[int, int]:
     """First capture time (included) and last (excluded) of a clip.
 
-    `shift`: so many clips later, or earlier where negative. UserError without such a fish.
+    `shift`: so many clips later, or earlier if negative. UserError without such a fish.
     """
-    for one in report.fish:
-        if one.estimate.track_id == track_id:
-            first = one.estimate.first_timestamp_ns - _MARGIN_NS
-            last = one.estimate.last_timestamp_ns + _MARGIN_NS + 1
+    for fish in report.fish:
+        if fish.estimate.track_id == track_id:
+            first = fish.estimate.first_timestamp_ns - _MARGIN_NS
+            last = fish.estimate.last_timestamp_ns + _MARGIN_NS + 1
             length = min(last - first, _MAX_NS)
             return first + shift * length, first + (shift + 1) * length
     raise UserError(f"expected a fish of this review, got {track_id}")
@@ -44,8 +44,8 @@ def fish_clip(
 ) -> Iterator[bytes]:
     """Chunks, each after its size as four bytes (little-endian): for each frame JSON and JPEG.
 
-    The JSON has the frame's number, time, size and outlines; the JPEG is empty where neither the
-    source nor the recording has the picture. UserError where there is no such fish.
+    The JSON has the frame's number, time, size and outlines; the JPEG is empty if neither the
+    source nor the recording has the picture. UserError without such a fish.
     """
     return _chunks(report, pictures, clip_span_ns(report, track_id, shift))
 
@@ -66,7 +66,7 @@ def _chunks(report: RunReport, pictures: FrameLookup, span_ns: tuple[int, int]) 
 
 
 def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dict[str, Any]]]:
-    """By frame: outline, points and reason of each fish, in frame pixels."""
+    """Outline, points and reason of each fish by frame, in frame pixels."""
     database = database_of(report.path) if report.edits.fish else None
     messages = ReviewedMessages(report.recording, database, Selection(time_ns=span_ns))
     frames = defaultdict[int, dict[int, dict[str, Any]]](dict)
@@ -74,15 +74,15 @@ def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dic
         if not isinstance(message, FishCrop | LocalizedFish):
             continue
         fish = message.track_id
-        one = frames[message.frame_index].setdefault(
+        drawn = frames[message.frame_index].setdefault(
             fish, {"fish": fish, "mask": [], "points": [], "reason": ""}
         )
         if isinstance(message, FishCrop):
-            one["mask"] = _mask_lines(message)
+            drawn["mask"] = _mask_lines(message)
         else:
-            one["reason"] = message.reason
+            drawn["reason"] = message.reason
             if message.keypoints_px is not None:  # None: the fit was refused
-                one["points"] = np.round(message.keypoints_px, 1).tolist()
+                drawn["points"] = np.round(message.keypoints_px, 1).tolist()
     return {frame: [of[fish] for fish in sorted(of)] for frame, of in frames.items()}
 
 

@@ -1,8 +1,8 @@
-"""What was corrected in a VIAME CSV of a run becomes verdicts and edits, as `review` makes them.
+"""Turn the corrections in a VIAME CSV of a run into verdicts and edits, as `review` makes them.
 
-A row is the fish that has its box, whatever number its track has: DIVE gives new ones. A box that
-no fish has was drawn. Frames of a fish that other tracks have are split off and merged with those;
-frames that no track has are split off and rejected.
+A row belongs to the fish with its box, not to the number of its track, which DIVE changes. A box
+without a fish was drawn. Frames of a fish in other tracks are split off and merged with those;
+frames in no track are split off and rejected.
 """
 
 import json
@@ -46,7 +46,7 @@ from stream_dmr.web.views import recorded_source
 
 _MOVED_PX = 1.0  # DIVE rounds boxes and points to whole pixels
 _SAME_OUTLINE = 0.8  # intersection over union, chosen: of small fish that were rounded as well
-_NO_SPECIES = ("", NO_SPECIES, "unknown")  # the last is what DIVE calls a new track
+_NO_SPECIES = ("", NO_SPECIES, "unknown")  # the last is DIVE's name for a new track
 
 
 def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list[str], list[str]]:
@@ -67,45 +67,45 @@ def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list
         made = read_verdicts(copy)[len(said) :]
         added = read_added_frames(copy)
         frames = [
-            one for verdict in made if verdict.kind == "add" for one in added[verdict.track_id]
+            frame for verdict in made if verdict.kind == "add" for frame in added[verdict.track_id]
         ]
-        new = [*added, *(one.other_fish or 0 for one in made if one.kind == "split")]
+        new = [*added, *(verdict.other_fish or 0 for verdict in made if verdict.kind == "split")]
         last = max(new, default=None)
     if made:
         add_verdict(database, *made, frames=frames, new_fish=last, known=len(said))
         seal_verdicts(database.parent)
-    return [f"fish {one.track_id}: {one.in_words}" for one in made], corrections.doubts
+    return [f"fish {verdict.track_id}: {verdict.in_words}" for verdict in made], corrections.doubts
 
 
 class _Comparison:
-    """What a file of tracks has otherwise than the run as reviewed. Raises AnnotationError."""
+    """Differences of a file of tracks from the run as reviewed. Raises AnnotationError."""
 
     def __init__(self, report: RunReport, path: Path) -> None:
         recorded = messages_of(report.recording, Frame)
         self.path = path
-        self.times_ns = {one.frame_index: one.timestamp_ns for one in recorded}
+        self.times_ns = {frame.frame_index: frame.timestamp_ns for frame in recorded}
         # By fish and frame: the track of the file that has its box; None: none has.
         self.track_of = defaultdict[int, dict[int, int | None]](dict)
         self.drawn = defaultdict[int, dict[int, AnnotatedBox]](dict)  # by track and frame
-        # By track and frame: head and tail where they were moved to, in pixels of the crop.
+        # By track and frame: the new places of moved heads and tails, in pixels of the crop.
         self.moved = dict[tuple[int, int], Sequence[Point]]()
         self.species = defaultdict[int, set[str]](set)  # by track
-        self._fish = {one.estimate.track_id: one for one in report.fish}
+        self._fish = {fish.estimate.track_id: fish for fish in report.fish}
         source = report.source or recorded_source(report.recording)
         pictures = None if source is None else Path(source)
         rows = load_boxes(path, pictures=pictures, parse=_parse_whole)
         database = require_database(report)
         # Fish and frames of boxes that were drawn before: their points were found anew.
         self._found_anew = {
-            (report.edits.fish_of(track_id, one.frame_index), one.frame_index)
+            (report.edits.fish_of(track_id, frame.frame_index), frame.frame_index)
             for track_id, frames in read_added_frames(database).items()
-            for one in frames
+            for frame in frames
         }
         reviewed = ReviewedMessages(report.recording, database)
         self._ends_px = {
-            (one.track_id, one.frame_index): one.keypoints_px[[0, 2]]
-            for one in reviewed.of(LocalizedFish)
-            if one.keypoints_px is not None
+            (fish.track_id, fish.frame_index): fish.keypoints_px[[0, 2]]
+            for fish in reviewed.of(LocalizedFish)
+            if fish.keypoints_px is not None
         }
         crops = reviewed.of(FishCrop)
         for frame_index, of_frame in groupby(crops, key=lambda crop: crop.frame_index):
@@ -124,7 +124,7 @@ class _Comparison:
     ) -> None:
         crops = {crop.track_id: crop for crop in found}
         left_out = {k for k in crops if k not in self._fish or not self._fish[k].counts}
-        near = sorted(  # the same number first, where fish have equal boxes
+        near = sorted(  # the same number first, if fish have equal boxes
             (track_id in left_out, track_id != box.track_id, shift_px, track_id, number)
             for track_id, crop in crops.items()
             for number, box in enumerate(boxes)
@@ -168,11 +168,11 @@ class _Comparison:
                 )
         placed = self._fish[crop.track_id].review.moved.get(crop.frame_index)
         known = [self._ends_px.get((crop.track_id, crop.frame_index)), placed]
-        known = [np.array(one) for one in known if one is not None]
+        known = [np.array(ends) for ends in known if ends is not None]
         if box.ends_px is None or not known:
             return
         ends_px = box.ends_px - 0.5  # from the centre of the first pixel
-        if min(np.abs(ends_px - one).max() for one in known) >= _MOVED_PX:
+        if min(np.abs(ends_px - ends).max() for ends in known) >= _MOVED_PX:
             self.moved[box.track_id, crop.frame_index] = crop_from_frame(
                 ends_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
             ).tolist()
@@ -188,7 +188,7 @@ def _parse_whole(text: str, path: Path, pictures: Sequence[Path]) -> dict[int, l
 
 
 class _Corrections:
-    """Says the verdicts that make the fish of a run those of a file."""
+    """Makes the verdicts that turn the fish of a run into those of a file."""
 
     def __init__(self, recorder: VerdictRecorder, file: _Comparison) -> None:
         self._recorder, self._file = recorder, file
@@ -209,7 +209,7 @@ class _Corrections:
                     self._say("correct", kept, frame_index=frame_index, head=head, tail=tail)
 
     def _split(self) -> dict[int, list[int]]:
-        """Split fish where their track changes, reject what no track has; the rest by track."""
+        """Split fish where their track changes, reject frames in no track; the rest by track."""
         pieces = defaultdict[int, list[int]](list)
         for fish, track_of in self._file.track_of.items():
             for number, (track, frames) in enumerate(groupby(track_of, key=track_of.__getitem__)):
@@ -222,9 +222,10 @@ class _Corrections:
         return pieces
 
     def _runs(self, boxes: Mapping[int, AnnotatedBox]) -> Iterator[list[dict[str, Any]]]:
-        """The drawn boxes, those of frames that follow each other together."""
+        """The drawn boxes, in groups of consecutive frames."""
         names = ("x0", "y0", "x1", "y1")
-        for is_drawn, run in groupby(self._file.times_ns.items(), key=lambda one: one[0] in boxes):
+        times = self._file.times_ns.items()
+        for is_drawn, run in groupby(times, key=lambda frame: frame[0] in boxes):
             if is_drawn:
                 yield [
                     {"frame_index": frame_index, "timestamp_ns": str(time_ns)}
@@ -234,7 +235,7 @@ class _Corrections:
 
     def _name(self, fish: int, track: int) -> None:
         named = self._file.species[track] - {*_NO_SPECIES}
-        known = {one.estimate.track_id: one for one in self._recorder.report.fish}
+        known = {fish.estimate.track_id: fish for fish in self._recorder.report.fish}
         before = species_name(known[fish])
         if len(named) > 1 or (not named and before != NO_SPECIES):
             raise AnnotationError(

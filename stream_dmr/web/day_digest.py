@@ -1,4 +1,4 @@
-"""Digests: one small signed file for each day of a run, which goes ashore over a thin link."""
+"""Digests: a small signed file for each day of a run, sent ashore over a thin link."""
 
 import shutil
 import threading
@@ -40,7 +40,7 @@ MAX_BYTES = 50_000
 _MAX_POSITIONS, _MAX_EVENTS, _MAX_RECORDINGS, _MAX_WARNINGS, _MAX_TEXT = 288, 48, 96, 5, 200
 _PICTURE_PX, _WEBP_QUALITY = 64, 50
 FISH_COLUMNS = ("id", "utc", "length_mm", "low_mm", "high_mm", "species", "status", "haul", "fate")
-_WRITTEN = "digest"  # the kind of event by which a run notes that it wrote one
+_WRITTEN = "digest"  # the kind of event that notes a written digest
 _DAY_NS, _EPOCH = 86_400_000_000_000, date(1970, 1, 1)
 _SETTLE_NS = 600_000_000_000  # after a day's end: a row of `watched` takes five minutes
 _LOOK_S, _NEVER = 300.0, threading.Event()
@@ -59,10 +59,10 @@ def write_digest(
     problems: Sequence[str] = (),
     stop: threading.Event = _NEVER,
 ) -> int:
-    """Write the digest of a UTC day: of the fish whose tracks ended on it, as they were measured.
+    """Write the digest of a UTC day: of the fish whose tracks ended on it, as measured.
 
-    `problems`: of the run, now. `stop`: leaves out the pictures that are not made yet. Returns its
-    bytes, more than MAX_BYTES only for rows of fish. OutputError where nothing is known of the day.
+    `problems`: of the run, now. `stop`: leaves out pictures that are not made yet. Returns its
+    bytes, more than MAX_BYTES only for rows of fish. OutputError if nothing is known of the day.
     """
     days, zero_ns = _days(folder / DATABASE)
     if day not in days:
@@ -71,7 +71,7 @@ def write_digest(
     began_ns = (day - _EPOCH).days * _DAY_NS - zero_ns
     span = Haul(name="", began_ns=began_ns, ended_ns=began_ns + _DAY_NS)
     fish = read_measured_fish(folder / DATABASE)
-    fish = [one for one in fish if span.includes(one.estimate.last_timestamp_ns)]
+    fish = [caught for caught in fish if span.includes(caught.estimate.last_timestamp_ns)]
     content = _content(folder / DATABASE, span, fish, zero_ns, problems)
     content["box"]["num_fish"] = days.total()
     recordings = _recordings(folder, span)
@@ -87,8 +87,8 @@ def write_digest(
 
 
 def _days(database: Path) -> tuple[Counter[date], int]:
-    """The number of fish of each UTC day that was watched; what gives UTC of capture times, ns."""
-    zeros, found = [one.utc_zero_ns for one in read_runs(database).values()], Counter[date]()
+    """The number of fish of each watched UTC day; the offset of UTC to capture times, ns."""
+    zeros, found = [facts.utc_zero_ns for facts in read_runs(database).values()], Counter[date]()
     if not zeros or (zero_ns := zeros[-1]) is None:
         raise OutputError(
             f"{database.parent}: expected a run that knows the time of day, got one that does not; "
@@ -107,9 +107,9 @@ def _day_of(utc_ns: int) -> date:
 def _content(
     database: Path, span: Haul, fish: Sequence[Fish], zero_ns: int, problems: Sequence[str]
 ) -> dict[str, Any]:
-    """What lengths.db has of a day."""
+    """The rows of a day in lengths.db."""
     facts, efforts = [*read_runs(database).values()][-1], read_effort(database, fish, span=span)
-    hours = sum(one.hours_watched for one in efforts)
+    hours = sum(effort.hours_watched for effort in efforts)
     if (scale := last_checks(database).get(facts.calibration_sha256)) and scale.alarm:
         problems = list(dict.fromkeys([*problems, scale.alarm]))
     track = VesselTrack(p for p in read_positions(database) if span.includes(p.timestamp_ns))
@@ -118,7 +118,7 @@ def _content(
         for row in read_rows(database, EVENTS)
         if span.includes(row["timestamp_ns"]) and row["kind"] != _WRITTEN
     ]
-    flags = Counter(flag[:_MAX_TEXT] for one in fish for flag in one.flags)
+    flags = Counter(flag[:_MAX_TEXT] for caught in fish for flag in caught.flags)
     warnings = [f"{count} fish: {flag}" for flag, count in flags.most_common(_MAX_WARNINGS)]
     with reading(database) as connection:
         chain = [[last.number, last.sha256] for last in read_chain(connection)[-1:]]
@@ -177,9 +177,9 @@ def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
 
 
 def grouped_sums(paths: Sequence[Path], *, most: int = _MAX_RECORDINGS) -> list[list[str]]:
-    """Name and SHA-256 of each file; of more than `most` first name, last name and one of a group.
+    """Name and SHA-256 of each file; above `most`, first name, last name and SHA-256 of groups.
 
-    That of a group is of what `sha256sum` prints of its files.
+    A group's SHA-256 is of the output of `sha256sum` for its files.
     """
     size = max(1, -(-len(paths) // most))
     if size == 1:
@@ -192,9 +192,9 @@ def _pictures(
     fish: Sequence[Fish], recordings: Sequence[tuple[int, Path]], stop: threading.Event
 ) -> Iterator[tuple[str, bytes]]:
     """Name and WebP of each fish that a recording shows, by its best frame; the best fits first."""
-    for one in sorted(fish, key=lambda one: -(one.iou or 0.0)):
-        track_id = one.estimate.track_id
-        index = bisect_right(recordings, one.middle_ns, key=lambda recording: recording[0])
+    for caught in sorted(fish, key=lambda caught: -(caught.iou or 0.0)):
+        track_id = caught.estimate.track_id
+        index = bisect_right(recordings, caught.middle_ns, key=lambda recording: recording[0])
         with suppress(UserError):  # a damaged recording
             if stop.is_set() or not index:
                 continue  # index 0: in a recording that began the day before
@@ -212,9 +212,9 @@ def _pictures(
 class DailyDigests:
     """Writes the digest of each day of a run when it is over, in a thread of its own.
 
-    What was written is an event in lengths.db, so that neither an emptied folder nor a restart nor
-    days without power lose a day or repeat one. A day is written again, by the same name, only if
-    a fish of it came later, such as one that a crash interrupted.
+    Each written digest is an event in lengths.db, so that neither an emptied folder nor a restart
+    nor days without power lose or repeat a day. A day is written again, by the same name, only if a
+    fish of it came later, such as a fish that a crash interrupted.
     """
 
     def __init__(
@@ -235,12 +235,12 @@ class DailyDigests:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop, once what is being written is noted. Idempotent."""
+        """Stop, once a digest in progress is noted. Idempotent."""
         self._ended.set()
         self._thread.join()
 
     def write_due(self) -> None:
-        """Write what is missing of the days that are over. Raises OutputError."""
+        """Write the missing digests of past days. Raises OutputError."""
         out, today = self._store.path.parent, _day_of(self._now_ns() - _SETTLE_NS)
         events = read_rows(self._store.path, EVENTS)
         told = {row["text"] for row in events if row["kind"] == _WRITTEN}
@@ -258,5 +258,5 @@ class DailyDigests:
         while not self._ended.wait(_LOOK_S):
             try:
                 self.write_due()
-            except Exception as error:  # measuring goes on
+            except Exception as error:  # measuring continues
                 self._on_notice(f"[digest] could not be written, tried again later: {error}")

@@ -1,4 +1,4 @@
-"""One page about all boxes of a fleet, asked one by one, or told by their digests."""
+"""One page about all boxes of a fleet, by their status pages or their digests."""
 
 import json
 import time
@@ -30,17 +30,17 @@ from stream_dmr.store.ledger import load_public_key
 from stream_dmr.web.pages import render
 
 _TIMEOUT_S = 10.0  # chosen: a link by satellite takes a second or two
-_MAX_ANSWER_BYTES = 1_000_000  # chosen: a hundred times what a box says
+_MAX_ANSWER_BYTES = 1_000_000  # chosen: a hundred times the size of a box's answer
 _MAX_AT_ONCE = 16
 _MAX_ALARM_CHARACTERS = 300
 _MAX_WARNINGS = 5  # shown of each box, the latest
-_WARNING_AGE_S = 86_400.0  # older ones are history
-_MAX_DIGEST_AGE = timedelta(days=2)  # that of yesterday comes today
+_WARNING_AGE_S = 86_400.0  # older warnings are history
+_MAX_DIGEST_AGE = timedelta(days=2)  # yesterday's digest comes today
 
 
 _WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
 _SUMMARY = {"healthy": "measuring", "unhealthy": "with a problem", "silent": "silent"}
-_ORDER = tuple(reversed(_WORDS))  # what needs a look comes first
+_ORDER = tuple(reversed(_WORDS))  # boxes with problems come first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class Box:
 
 
 def _shown(text: str) -> str:
-    """The beginning of what a box says, as text that any file takes: JSON may hold half letters."""
+    """The beginning of a box's text, without half letters, which JSON but no file may hold."""
     return text[:_MAX_ALARM_CHARACTERS].encode(errors="backslashreplace").decode()
 
 
@@ -65,7 +65,7 @@ _Lines = Annotated[tuple[Annotated[str, AfterValidator(_shown)], ...], Field(str
 
 
 class BoxReading(BaseModel):
-    """What a box said of itself."""
+    """The state of a box by its own report."""
 
     model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
@@ -106,12 +106,12 @@ class BoxState:
 
     @property
     def alarms(self) -> Sequence[str]:
-        """What is wrong now: the failed contact, or the problems that the box reports."""
+        """Present problems: a failed contact, or the problems that the box reports."""
         return [self.error] if self.error or self.reading is None else self.reading.problems
 
     @property
     def signature_text(self) -> str:
-        """Whether what the last digest says is known to be the device's; "" without a digest."""
+        """The state of the last digest's signature, in words; "" without a digest."""
         if not self.box.address.startswith("file:") or self.reading is None:
             return ""
         if self.box.key is None:
@@ -126,14 +126,14 @@ class BoxState:
 def load_boxes(given: Sequence[str]) -> list[Box]:
     """The boxes of addresses, and of files with one `NAME ADDRESS` or `ADDRESS` a line.
 
-    An address is that of a status page, with `?token=...` where it asks for one, a digest or a
-    folder of digests, which the device's FILE.pub may follow; # begins a comment. Raises
-    ConfigError for files and addresses that can't be used, and doubled ones; UserError for keys.
+    An address is of a status page, with `?token=...` if it asks for one, a digest or a folder of
+    digests, which the device's FILE.pub may follow; # begins a comment. Raises ConfigError for
+    unusable files and addresses, and repeated addresses; UserError for keys.
     """
     boxes = list[Box]()
-    for one in given:
-        is_address = "://" in one or _has_digests(one)
-        boxes += [_box(one, where=one)] if is_address else _read_file(Path(one))
+    for text in given:
+        is_address = "://" in text or _has_digests(text)
+        boxes += [_box(text, where=text)] if is_address else _read_file(Path(text))
     for number, box in enumerate(boxes):
         if any(box.address == other.address for other in boxes[:number]):
             raise ConfigError(f"{box.address}: expected each box once, got it twice; remove one")
@@ -192,7 +192,7 @@ def _box(text: str, *, where: str, name: str = "", key: str = "") -> Box:
 
 
 def ask_all(states: Iterable[BoxState], *, timeout_s: float = _TIMEOUT_S) -> list[BoxState]:
-    """Ask every box, several at once; those that don't answer keep their last reading."""
+    """Ask every box, several at once; boxes that don't answer keep their last reading."""
     with ThreadPoolExecutor(_MAX_AT_ONCE) as pool:
         return list(pool.map(partial(_ask, timeout_s=timeout_s), states))
 
@@ -216,7 +216,7 @@ def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
 
 
 def _told_by_digest(before: BoxState) -> BoxState:
-    """The state by the last digest; a box whose last one is old is silent."""
+    """The state by the last digest; a box whose last digest is old is silent."""
     path = Path(url2pathname(urlsplit(before.box.address).path))
     last = max(path.glob("digest-*.zip"), default=None) if path.is_dir() else path
     if last is None:
@@ -243,13 +243,13 @@ def _failure(failure: Exception) -> str:
 
 
 def _get(box: Box, path: str, until_s: float) -> bytes:
-    """What a box answers. Raises OSError or HTTPException; TimeoutError if it is not whole then."""
+    """The answer of a box. Raises OSError or HTTPException; TimeoutError if it is incomplete."""
     url, left_s = urlsplit(box.address + path), max(until_s - time.monotonic(), 0.001)
     headers = {"Authorization": f"Bearer {box.token}"} if box.token else {}
     kind = HTTPSConnection if url.scheme == "https" else HTTPConnection
     with closing(kind(url.netloc, timeout=left_s)) as connection:
         connection.connect()
-        # The timeout is that of one byte; this ends an answer that drips.
+        # The timeout is for a single byte; the timer ends an answer that drips.
         timer = Timer(left_s, connection.sock.shutdown, (SHUT_RDWR,))
         timer.start()
         try:
@@ -270,7 +270,7 @@ def _get(box: Box, path: str, until_s: float) -> bytes:
 
 
 def _values(text: str) -> dict[str, float]:
-    """Metrics by name, those of all labels added up."""
+    """Metrics by name, summed over all labels."""
     values = dict[str, float]()
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
@@ -279,11 +279,11 @@ def _values(text: str) -> dict[str, float]:
 
 
 def _reading(health: Any, values: dict[str, float]) -> BoxReading:
-    recent = [one for one in health["warnings"] if one["age_s"] <= _WARNING_AGE_S]
+    recent = [warning for warning in health["warnings"] if warning["age_s"] <= _WARNING_AGE_S]
     return BoxReading(
         is_healthy=health["healthy"],
-        problems=tuple(str(one) for one in health["problems"]),
-        warnings=tuple(str(one["line"]) for one in recent[:_MAX_WARNINGS]),
+        problems=tuple(str(warning) for warning in health["problems"]),
+        warnings=tuple(str(warning["line"]) for warning in recent[:_MAX_WARNINGS]),
         num_fish=int(values.get("stream_dmr_fish_total", 0)),
         fish_per_hour=values["stream_dmr_fish_per_hour"],
         frames_per_s=values["stream_dmr_frames_per_second"],
@@ -308,7 +308,7 @@ class _Kept(BaseModel):
 
 
 def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
-    """The last contact of each box; none where there is no file yet.
+    """The last contact of each box; none if there is no file yet.
 
     Raises OutputError for a file that is no such memory.
     """
@@ -322,8 +322,8 @@ def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
             "choose another --out, or remove it"
         ) from error
     return [
-        BoxState(box=box, contact_ns=one.contact_ns, reading=one.reading)
-        if (one := kept.get(box.address))
+        BoxState(box=box, contact_ns=known.contact_ns, reading=known.reading)
+        if (known := kept.get(box.address))
         else BoxState(box=box)
         for box in boxes
     ]
@@ -332,15 +332,15 @@ def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
 def write_memory(path: Path, states: Iterable[BoxState]) -> None:
     """Keep the last contacts, without tokens. Raises OutputError."""
     kept = {
-        one.box.address: _KeptBox(contact_ns=one.contact_ns, reading=one.reading)
-        for one in states
-        if one.contact_ns is not None and one.reading is not None
+        state.box.address: _KeptBox(contact_ns=state.contact_ns, reading=state.reading)
+        for state in states
+        if state.contact_ns is not None and state.reading is not None
     }
     replace_text(path, _Kept(boxes=kept).model_dump_json(indent=1))
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text in one step: who reads meanwhile gets the old or the new. Raises OutputError."""
+    """Write a text in one step: readers get the old or the new text. Raises OutputError."""
     with replacing(path) as draft:
         draft.write_text(text, encoding="utf-8", errors="backslashreplace")  # names of files
 

@@ -37,7 +37,7 @@ def open_report(
 ) -> RunReport:
     """Read the report of a run's folder or of a recording; `as_measured`: without any review.
 
-    Raises a UserError where they can't be read, or where `source` is not the recorded one.
+    Raises a UserError if they can't be read, or if `source` is not the recorded one.
     """
     recording = open_results(path)
     header = recording.header
@@ -64,7 +64,7 @@ def open_report(
         source=source,
         efforts=[]
         if database is None
-        else read_effort(database, [one for one in fish if one.counts]),
+        else read_effort(database, [caught for caught in fish if caught.counts]),
         track=recorded_track(recording)
         if database is None
         else VesselTrack(read_positions(database)),
@@ -90,7 +90,7 @@ def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLooku
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
-    """The folders of runs; of a batch those of its videos that are done."""
+    """The folders of runs; for a batch the folders of its finished videos."""
     found = list[Path]()
     for folder in folders:
         if _is_batch(folder):
@@ -114,7 +114,7 @@ def open_folders(
 ) -> tuple[list[RunReport], list[str]]:
     """A report of each run of several folders and batches, and a line for each video that failed.
 
-    Raises UserError, also where their fish can't stand in one page.
+    Raises UserError, also if their fish don't fit into one page.
     """
     reports, failed = list[RunReport](), list[str]()
     for folder in folders:
@@ -126,8 +126,9 @@ def open_folders(
                 f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos "
                 "have their own"
             )
-        for one in done:
-            reports.append(open_report(one, source=source, config=config, as_measured=as_measured))
+        for run in done:
+            report = open_report(run, source=source, config=config, as_measured=as_measured)
+            reports.append(report)
         rows = read_videos(folder) if _is_batch(folder) else []
         failed += [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     names = {report.recording.header.template.name for report in reports}
@@ -147,7 +148,7 @@ def write_report(
     notes: Sequence[str] = (),
     coast: Sequence[Line] = (),
 ) -> int:
-    """Write the page and return its bytes; beside results, `verify` checks it as one of them.
+    """Write the page and return its bytes; beside results, `verify` checks it as well.
 
     `coast` is drawn on the map.
     """

@@ -35,7 +35,7 @@ from stream_dmr.web.views import DrawnView, DrawnViews, FishFrame, RecordedTrack
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """The results of one run with what was recorded of each fish."""
+    """The results of a run with the recorded frames of each fish."""
 
     path: Path
     recording: Recording
@@ -45,11 +45,11 @@ class RunReport:
     config: Config  # of the run
     settings: FisheriesSettings
     edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
-    source: str | None = None  # where the user says that the source is
-    efforts: Sequence[HaulEffort] = ()  # of its hauls; none of a recording without its database
+    source: str | None = None  # the place of the source by the user
+    efforts: Sequence[HaulEffort] = ()  # of its hauls; none for a recording without its database
     track: VesselTrack | None = None  # None: likewise
     watched_ns: Sequence[int] = ()  # capture times between which there were frames; none: likewise
-    notes: Sequence[str] = ()  # what a reader must know of the run
+    notes: Sequence[str] = ()  # for readers, about the run
 
     @property
     def title(self) -> str:
@@ -58,24 +58,24 @@ class RunReport:
     @property
     def span_s(self) -> tuple[float, float]:
         """Capture times of the first and last frame, as far as they are known; else of the fish."""
-        estimates = [one.estimate for one in self.fish]
-        firsts = [*self.watched_ns, *(one.first_timestamp_ns for one in estimates)]
-        lasts = [*self.watched_ns, *(one.last_timestamp_ns for one in estimates)]
+        estimates = [fish.estimate for fish in self.fish]
+        firsts = [*self.watched_ns, *(estimate.first_timestamp_ns for estimate in estimates)]
+        lasts = [*self.watched_ns, *(estimate.last_timestamp_ns for estimate in estimates)]
         return min(firsts, default=0) / 1e9, max(lasts, default=0) / 1e9
 
 
 def trip_section(
     reports: Sequence[RunReport], *, coast: Sequence[Line] = (), is_folded: bool = False
 ) -> str:
-    """HTML: who and when, a row for each haul, and where; "" where nothing of it is known.
+    """HTML: vessel and time, a row for each haul, and a map; "" if nothing of it is known.
 
-    `is_folded`: only the heading, until somebody asks for more.
+    `is_folded`: only the heading, until somebody opens it.
     """
-    fish = [one for report in reports for one in report.fish if one.counts]
+    fish = [caught for report in reports for caught in report.fish if caught.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
     drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
     heading = _heading(fish)
-    if not (heading or drawn or any(one.haul for one in fish)):
+    if not (heading or drawn or any(caught.haul for caught in fish)):
         return ""
     return render("report/trip.html", heading=heading, rows=rows, map=drawn, is_folded=is_folded)
 
@@ -83,12 +83,12 @@ def trip_section(
 def _heading(fish: Sequence[Fish]) -> str:
     """Vessel, trip and hauls, and the time from the first fish to the last."""
     parts = [
-        _named("", {one.facts.vessel for one in fish}),
-        _named("trip", {one.facts.trip for one in fish}),
-        _named("haul", {one.haul for one in fish}),
+        _named("", {caught.facts.vessel for caught in fish}),
+        _named("trip", {caught.facts.trip for caught in fish}),
+        _named("haul", {caught.haul for caught in fish}),
     ]
     what = ", ".join(part for part in parts if part)
-    times = sorted(one.utc_ns for one in fish if one.utc_ns is not None)
+    times = sorted(caught.utc_ns for caught in fish if caught.utc_ns is not None)
     if times:
         span = _span(*(utc_text(time_ns) or "" for time_ns in (times[0], times[-1])))
         what += f"{': ' if what else ''}{span} UTC"
@@ -102,7 +102,7 @@ def _named(what: str, names: Iterable[str]) -> str:
 
 
 def _span(*times: str) -> str:
-    """Times in ISO 8601 to the minute, for people; the day stands once where it is the same."""
+    """Times in ISO 8601 to the minute, for people; equal days are written once."""
     first, last = (time[:16].replace("T", " ") for time in times)
     if not (first and last):
         return first or last
@@ -111,13 +111,14 @@ def _span(*times: str) -> str:
 
 def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
     """A row of the table for each haul: texts by the heads of their columns."""
-    counted = [one for one in report.fish if one.counts]
-    zeros = {one.facts.utc_zero_ns for one in counted}
+    counted = [caught for caught in report.fish if caught.counts]
+    zeros = {caught.facts.utc_zero_ns for caught in counted}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
     for effort in report.efforts:
-        fish = [one for one in counted if one.haul == effort.haul]
+        fish = [caught for caught in counted if caught.haul == effort.haul]
         row = haul_row(effort, utc_zero_ns=zero_ns)
-        share, lengths = effort.share_measured, [one.length_mm for one in fish if one.length_mm]
+        share = effort.share_measured
+        lengths = [caught.length_mm for caught in fish if caught.length_mm]
         name = effort.haul or "-"
         yield {
             "haul": f"{report.title}: {name}" if many else name,
@@ -128,10 +129,10 @@ def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
             "with length": str(len(lengths)),
             "mean": f"{mean(lengths) / 10:.1f} cm" if lengths else "",
             "species": _counted(
-                one.sure_code or one.review.species or one.estimate.species_code or ""
-                for one in fish
+                caught.sure_code or caught.review.species or caught.estimate.species_code or ""
+                for caught in fish
             ),
-            "fate": _counted(one.fate or "" for one in fish),
+            "fate": _counted(caught.fate or "" for caught in fish),
         }
 
 
@@ -148,7 +149,7 @@ def _counted(names: Iterable[str]) -> str:
 
 _SCRIPTS = ("table.js", "plots.js", "detail.js")
 _REVIEW_SCRIPTS = ("clip.js", "boxes.js", "points.js", "review.js", "keys.js")
-_MAX_TRACKS = 10**9  # of one run, in the numbers of a page of many
+_MAX_TRACKS = 10**9  # of each run, in the numbers of a page of many runs
 _MAX_COORDINATE = 32000  # the coordinates of a mesh are int16
 
 
@@ -160,7 +161,7 @@ def render_page(
     review: Mapping[str, Any] | None = None,
     coast: Sequence[Line] = (),
 ) -> str:
-    """The page of one report, or of all reports of a batch; these have the same template.
+    """The page of a report, or of all reports of a batch, which have the same template.
 
     With a `review` it takes verdicts and sends them to its server; it has the `reviewer`, `blind`
     and perhaps the `sample`.
@@ -169,26 +170,26 @@ def render_page(
     placed = place(reports)
     about = {
         "title": title,
-        "began_s": min(one.report.span_s[0] + one.shift_s for one in placed),
+        "began_s": min(part.report.span_s[0] + part.shift_s for part in placed),
         "software": __version__,
         "template": template.name,
         "faces": _packed(template.faces.astype("<u4")),
         "fisheries": reports[0].settings.model_dump(),
-        "runs": {one.run_id: asdict(one.facts) for report in reports for one in report.fish},
+        "runs": {fish.run_id: asdict(fish.facts) for report in reports for fish in report.fish},
         "notes": [
             *notes,
-            *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
+            *(line for report in reports for line in (*report.notes, *report.recording.warnings)),
         ],
-        "shapes": [line for one in reports for line in _shape_notes(one)],
+        "shapes": [line for report in reports for line in _shape_notes(report)],
         "review": review,
         "fates": FATES,
         "conditions": CONDITIONS,
     }
-    rows = [one.row(fish) for one in placed for fish in one.report.fish]
+    rows = [part.row(fish) for part in placed for fish in part.report.fish]
     details = (
-        (one.row_id(fish.estimate.track_id), fish_detail(fish, one.report))
-        for one in placed
-        for fish in one.report.fish
+        (part.row_id(fish.estimate.track_id), fish_detail(fish, part.report))
+        for part in placed
+        for fish in part.report.fish
     )
     return render(
         "report/page.html",
@@ -216,7 +217,7 @@ def _shape_notes(report: RunReport) -> Iterator[str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlacedReport:
-    """A report among those of a page."""
+    """A report among the reports of a page."""
 
     report: RunReport
     run: int  # from 0
@@ -252,7 +253,7 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
-    """The row of a fish in the table: that of fish.csv, and its best view, small."""
+    """The row of a fish in the table: its row of fish.csv, and its best view, small."""
     record = fish_record(fish, report.recording.header.template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
@@ -289,7 +290,7 @@ def _moved_points(fish: Fish, views: Sequence[DrawnView]) -> dict[int, Any]:
 
 
 def fish_detail(fish: Fish, report: RunReport) -> dict[str, Any]:
-    """What a row opens: best views, every frame, the mesh."""
+    """The details that a row opens: best views, every frame, the mesh."""
     views = report.views.get(fish.estimate.track_id, [])
     track = report.tracks.get(fish.estimate.track_id)
     return {

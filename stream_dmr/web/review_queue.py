@@ -29,7 +29,7 @@ class AuditSample:
 
 
 class ReviewQueue:
-    """Takes the verdicts of one reviewer on the fish of all reports. Thread-safe."""
+    """Takes the verdicts of a reviewer on the fish of all reports. Thread-safe."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class ReviewQueue:
         blind: bool = False,
         sample: AuditSample | None = None,
     ) -> None:
-        """UserError where a report has no database or no recording."""
+        """UserError if a report has no database or no recording."""
         for report in reports:
             require_recording(report.recording, where=report.path, what="a review")
         self._reviewer, self._blind = reviewer, blind
@@ -73,8 +73,8 @@ class ReviewQueue:
     def record(self, content: bytes) -> dict[str, Any]:
         """Take a verdict in JSON. UserError if it is none.
 
-        Returns the `rows` of the fish that it changes, what was `said`, and what an `undo` takes
-        back next. An undo takes back the reviewer's last verdict, whichever run that is of.
+        Returns the `rows` of the fish that it changes, the verdict in words (`said`), and the
+        verdict that an `undo` takes back next, the reviewer's last verdict in any run.
         """
         submitted = parse_verdict(content)
         is_undo = submitted.kind == "undo"
@@ -86,14 +86,14 @@ class ReviewQueue:
         return {"rows": rows, "said": said, "undo": self._undo()[1]}
 
     def detail(self, run: int, track_id: int) -> dict[str, Any]:
-        """What a row opens. UserError where there is no such fish."""
+        """The details that a row opens. UserError without such a fish."""
         for fish, _ in self._fish(run):
             if fish.estimate.track_id == track_id:
                 return fish_detail(fish, self._recorder(run).report)
         raise UserError(f"expected a fish of this review, got {track_id}")
 
     def clip(self, run: int, track_id: int, shift: int) -> Iterator[bytes]:
-        """The clip around a fish, see `fish_clip`. UserError where there is no such fish."""
+        """The clip around a fish, see `fish_clip`. UserError without such a fish."""
         recorder = self._recorder(run)
         return fish_clip(recorder.report, recorder.pictures, track_id, shift=shift)
 
@@ -108,7 +108,7 @@ class ReviewQueue:
 
     def _undo(self) -> tuple[int, str]:
         """The run of this reviewer's last verdict, and that verdict in words; "" without any."""
-        times = [0 if one is None else one.written_ns for one in self._last]
+        times = [0 if verdict is None else verdict.written_ns for verdict in self._last]
         run = times.index(max(times))
         return run, self._in_words(run)
 
@@ -120,7 +120,8 @@ class ReviewQueue:
     def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
         rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
         placed = self.placed[run]
-        gone = [{"id": placed.row_id(one), "gone": True} for one in track_ids if one not in rows]
+        lost = [track_id for track_id in track_ids if track_id not in rows]
+        gone = [{"id": placed.row_id(track_id), "gone": True} for track_id in lost]
         return [*(row for row in rows.values() if self._is_shown(row)), *gone]
 
     def _fish(
@@ -136,50 +137,50 @@ class ReviewQueue:
                 yield seen, placed.row(seen)
 
     def _is_shown(self, row: dict[str, Any]) -> bool:
-        """True for the fish of the sample, and for those that were not there to be drawn."""
+        """True for the fish of the sample, and for fish added after it was drawn."""
         return self._chosen is None or row["id"] in self._chosen or row["id"] not in self._measured
 
 
 def species_choices(own_list: str) -> list[dict[str, str]]:
     """Codes and names that a reviewer may type, and the `value` that becomes the verdict.
 
-    A species of the user's own list stands by its code, which every reader of the verdict knows.
+    A species of the user's own list is given by its code, which every reader of the verdict knows.
     """
-    bundled = {one.code for one in load_species()}
+    bundled = {species.code for species in load_species()}
     try:
         known = load_species(own_list)
     except ConfigError:  # the list is not on this machine
         known = load_species()
     return [
         {
-            "code": one.code,
-            "name": one.english_name or one.scientific_name,
-            "scientific": one.scientific_name,
-            "value": one.scientific_name if one.code in bundled else one.code,
+            "code": species.code,
+            "name": species.english_name or species.scientific_name,
+            "scientific": species.scientific_name,
+            "value": species.scientific_name if species.code in bundled else species.code,
         }
-        for one in known
+        for species in known
     ]
 
 
 def measured_numbers(placed: Sequence[PlacedReport]) -> set[int]:
     """The numbers, in the page, of the fish that were measured."""
     return {
-        one.row_id(fish.estimate.track_id)
-        for one in placed
-        if (database := database_of(one.report.path)) is not None
+        part.row_id(fish.estimate.track_id)
+        for part in placed
+        if (database := database_of(part.report.path)) is not None
         for fish in read_measured_fish(database)
     }
 
 
 def sampled(numbers: set[int], sample: AuditSample) -> set[int]:
-    """Those that are drawn at random; equal seeds draw equal ones from the same numbers."""
+    """A random sample of the numbers; equal seeds draw equal samples."""
     rng = np.random.default_rng(sample.seed)
     size = min(sample.size, len(numbers))
     return set(rng.choice(sorted(numbers), size, replace=False).tolist())
 
 
 class ReviewServer(TokenServer):
-    """Serves the page on this machine, to those who have the token in `address`."""
+    """Serves the page on this machine, to people who have the token in `address`."""
 
     setting = "--port"
 

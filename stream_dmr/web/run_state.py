@@ -30,7 +30,7 @@ MAX_FINISHED = 20  # in the page's table
 _MAX_WARNINGS = 50
 _MAX_FITS = 1000  # for quantiles of their time
 _HOUR_S = 3600.0
-_MIN_RATE_WINDOW_S = 60.0  # else one fish in the first second would be thousands an hour
+_MIN_RATE_WINDOW_S = 60.0  # else a fish in the first second would be thousands an hour
 _RATE_WINDOW_S = 10.0
 _MAX_RATE_FRAMES = 300  # in this window
 _MAX_HOURLY_FISH = 10_000
@@ -73,8 +73,8 @@ class RunState:
     ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems.
 
-        So are a line of `scale_alarm`, that a known length was measured wrong, and a `store` whose
-        file or folder is not where it was, also while no frame comes.
+        So are a line of `scale_alarm` (a known length was measured wrong), and a `store` whose file
+        or folder was moved, also while no frame comes.
         """
         self.source = source
         self.positions, self.hauls = positions, hauls
@@ -82,7 +82,7 @@ class RunState:
         self.chain: Chain | None = None
         self.sinks = sinks or SinkStates()
         self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
-        self.num_fish: Counter[str] = Counter()  # finished ones, by status
+        self.num_fish: Counter[str] = Counter()  # finished fish, by status
         self.species: Counter[str] = Counter()  # of finished fish, by code
         self.fates: Counter[str] = Counter()
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
@@ -101,7 +101,7 @@ class RunState:
         self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
 
     def continue_after(self, store: LengthStore) -> None:
-        """Begin with the fish of earlier runs in the folder: their numbers, and the last ones."""
+        """Begin with the fish of earlier runs in the folder: their numbers, and the last fish."""
         for status, number in store.counts("status").items():
             self.num_fish[without_counts(status)] += number
         self.species.update(store.counts("species_code"))
@@ -109,7 +109,7 @@ class RunState:
         self.finished.extend(store.estimates())
 
     def take(self, message: Message) -> None:
-        """Keep what the page shows of a message; no picture is copied."""
+        """Keep the parts of a message that the page shows; no picture is copied."""
         with self._lock:
             match message:
                 case Frame():
@@ -145,7 +145,7 @@ class RunState:
             return list(self._warnings.values())[::-1]
 
     def latest_frame(self) -> MeasuredFrame | None:
-        """The latest frame whose fish are localized; the latest of all where there are no fish."""
+        """The latest frame with localized fish; the latest frame of all if there are no fish."""
         with self._lock:
             if not self._frames:
                 return None
@@ -153,7 +153,7 @@ class RunState:
             by_index = {kept.frame_index: kept for kept in self._frames}
             if self._fish and self._fish[-1].frame_index in by_index:
                 frame = by_index[self._fish[-1].frame_index]
-            fish = [one for one in self._fish if one.frame_index == frame.frame_index]
+            fish = [fish for fish in self._fish if fish.frame_index == frame.frame_index]
             return MeasuredFrame(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
 
     def frames_per_s(self) -> float:
@@ -178,14 +178,14 @@ class RunState:
         return {q: float(np.quantile(fit_s, q)) for q in (0.5, 0.9, 0.99)} if fit_s else {}
 
     def last_frame_age_s(self) -> float | None:
-        """Time since the last frame came from the camera; None where the source is no camera."""
+        """Time since the last frame came from the camera; None if the source is no camera."""
         counts = self.source.counts
         if counts is None:
             return None
         return (time.monotonic_ns() - counts.last_arrival_ns) / 1e9
 
     def disk_free_bytes(self) -> int:
-        """Room where the results go; 0 where that folder is away."""
+        """Free space in the folder of results; 0 if that folder is away."""
         try:
             return shutil.disk_usage(self._out_dir).free
         except OSError:
@@ -208,7 +208,7 @@ class RunState:
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:
-        """True where a stage has had one frame for longer than any fit takes."""
+        """True if a stage has had the same frame for longer than any fit takes."""
         return self.chain is not None and self.chain.longest_busy_s() > self._stuck_s
 
     def _finish(self, estimate: LengthEstimate) -> None:
@@ -264,12 +264,12 @@ def _stages(state: RunState) -> Iterator[Metric]:
     frames = CounterMetricFamily(
         "stream_dmr_frames", "Frames of each stage.", labels=["stage", "outcome"]
     )
-    for one in chain.counters:
+    for counts in chain.counters:
         for outcome in ("in", "processed", "dropped", "failed"):
-            frames.add_metric([one.stage, outcome], getattr(one, f"frames_{outcome}"))
+            frames.add_metric([counts.stage, outcome], getattr(counts, f"frames_{outcome}"))
     yield frames
     numbers = zip(chain.counters[1:], chain.waiting(), strict=True)
-    waiting = {one.stage: number for one, number in numbers}
+    waiting = {counts.stage: number for counts, number in numbers}
     yield _gauges("queue_frames", "Frames that wait before a stage.", "stage", waiting)
 
 

@@ -1,8 +1,8 @@
-"""HTTP for those who have a token, given by ?token=, a cookie or an Authorization header.
+"""Serve HTTP to people with a token, given by ?token=, a cookie or an Authorization header.
 
-Whoever connects is bounded: in connections, in the time that a request may take to arrive, and in
-the time that its answer may take to be read. A page of another site can't read along: the names
-Host and Origin of a request are checked.
+Clients are bounded: in connections, in the time that a request may take to arrive, and in the time
+that its answer may take to be read. A page of another site can't read along: the names Host and
+Origin of a request are checked.
 """
 
 import hmac
@@ -35,7 +35,7 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What was asked for, by who may ask."""
+    """An authorized request."""
 
     query: Mapping[str, list[str]]
     body: bytes  # of a POST
@@ -50,7 +50,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Response:
-    """An answer; one in parts ends with its connection."""
+    """An answer; an answer in parts ends with its connection."""
 
     content: bytes | Iterator[bytes]
     media_type: str = "text/html; charset=utf-8"
@@ -121,8 +121,8 @@ class TokenServer(ThreadingHTTPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a connection in a thread of its own.
 
-        Where there are too many, the oldest that has sent no request with the token makes room, one
-        of another machine first; where all have, this one is closed.
+        If there are too many, the oldest that has sent no request with the token makes room, first
+        those of other machines; if all have sent one, the new connection is closed.
         """
         with self._lock:
             is_busy = len(self._connections) >= self.max_connections and not self._end_stranger()
@@ -146,7 +146,7 @@ class TokenServer(ThreadingHTTPServer):
             self._forget(request)
 
     def admit(self, request: socket.socket) -> None:
-        """Let a connection stay whoever comes: it may read what it asks for."""
+        """Keep a connection for good: it has sent a request with the token."""
         with self._lock:
             self._strangers.pop(request, None)
 
@@ -247,14 +247,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _end_connection(self) -> None:
         with suppress(OSError):
-            self.connection.shutdown(socket.SHUT_RDWR)  # ends what waits for it
+            self.connection.shutdown(socket.SHUT_RDWR)  # ends threads that wait for it
 
     def _is_own_page(self) -> bool:
         """True unless a browser was led here by a page of another site.
 
         DNS rebinding: a page's own name, resolved to an address of this machine, lets that page
-        read what is served without a token. So a server for this machine alone answers to the names
-        of this machine alone. `Origin`, where a browser sends it, is where the page comes from.
+        read answers without a token. So a server for this machine alone answers to the names of
+        this machine alone. `Origin`, if a browser sends it, is the origin of the page.
         """
         host, origin = self.headers.get("Host"), self.headers.get("Origin")
         if host is not None and self.server.is_local:
@@ -281,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _is_authorized(self) -> bool:
-        """True where no token is asked for, or the request has it."""
+        """True if no token is needed, or the request has it."""
         if not self.server.token:
             return True
         scheme, _, token = self.headers.get("Authorization", "").partition(" ")

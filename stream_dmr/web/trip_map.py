@@ -20,7 +20,7 @@ _DEPTHS = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 
 
 
 def load_coast(path: Path) -> list[Line]:
-    """The lines of a file, and the edges of its areas. Raises UserError where it has none."""
+    """The lines of a file, and the edges of its areas. Raises UserError if it has none."""
     try:
         lines = list(_lines(json.loads(read_text(path, max_bytes=_MAX_BYTES))))
     except (OSError, UnicodeDecodeError) as error:
@@ -40,7 +40,7 @@ def _refusal(path: Path, what: str) -> UserError:
 
 
 def _lines(element: Any) -> Iterator[Line]:
-    """Of a collection, a feature or a geometry; points are left out."""
+    """The lines of a collection, a feature or a geometry; points are left out."""
     within = [*element.get("features", ()), *element.get("geometries", ()), element.get("geometry")]
     for part in within:
         if part is not None:
@@ -48,7 +48,7 @@ def _lines(element: Any) -> Iterator[Line]:
     if (depth := _DEPTHS.get(element["type"])) is not None:
         lines = [element["coordinates"]]
         for _ in range(depth):
-            lines = [part for one in lines for part in one]
+            lines = [part for part_lines in lines for part in part_lines]
         for line in lines:
             yield [(float(point[0]), float(point[1])) for point in line]
 
@@ -74,15 +74,15 @@ def draw_map(
         return ""
     view = _View(places)
     step = max(1, len(places) // _MAX_POINTS)
-    hauls = sorted({one.haul for one in fish})
+    hauls = sorted({caught.haul for caught in fish})
     colours = {haul: _COLOURS[k % len(_COLOURS)] for k, haul in enumerate(hauls)}
     return render(
         "report/map.html",
         width=_WIDTH,
         height=_HEIGHT,
-        shores=[points for one in coast for points in view.pieces(one)],
+        shores=[points for line in coast for points in view.pieces(line)],
         lines=[view.points([*piece[::step], piece[-1]]) for piece in pieces],
-        dots=[dot for one in fish if (dot := _dot(one, view, colours[one.haul]))],
+        dots=[dot for caught in fish if (dot := _dot(caught, view, colours[caught.haul]))],
         colours=colours,
         bar=view.scale_bar(),
         middle=view.middle(),
@@ -113,7 +113,7 @@ class _View:
         self.px_per_m = min((_WIDTH - 2 * _MARGIN) / wide_m, (_HEIGHT - 2 * _MARGIN) / high_m)
 
     def _unwrapped(self, longitude: float) -> float:
-        """Near the first one, so that no track is torn at 180 degrees."""
+        """The longitude near the first point's, so that no track is torn at 180 degrees."""
         return self._origin + (longitude - self._origin + 180) % 360 - 180
 
     def points(self, line: Line) -> str:
@@ -131,7 +131,7 @@ class _View:
                 near.clear()
 
     def _is_near(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
-        """True where the box around two points meets the picture; False across the other side."""
+        """True if the box around two points meets the picture; False across the other side."""
         half_px = 180 * self._squeeze * _M_PER_DEGREE * self.px_per_m
         return (
             abs(b[0] - a[0]) <= half_px
@@ -157,7 +157,7 @@ class _View:
         return {"x0": x1 - metres * self.px_per_m, "x1": x1, "y": _HEIGHT - 12.0, "text": text}
 
     def middle(self) -> str:
-        """The place of the middle, and where north is, in words."""
+        """The place of the middle, and the direction of north, in words."""
         longitude, latitude = self._middle
         longitude = (longitude + 180) % 360 - 180
         ns, ew = "NS"[latitude < 0], "EW"[longitude < 0]

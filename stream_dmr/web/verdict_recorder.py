@@ -1,4 +1,4 @@
-"""Check what a reviewer submits and write it as verdicts, edits and corrected lengths."""
+"""Check the submissions of a reviewer and write verdicts, edits and corrected lengths."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -73,11 +73,11 @@ class SubmittedVerdict(BaseModel):
     tail: Point | None = None
     other_fish: int | None = None
     boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=10_000)
-    sure: bool = False  # do it although it contradicts what is measured
+    sure: bool = False  # do it although it contradicts measurements
 
 
 def parse_verdict(content: bytes) -> SubmittedVerdict:
-    """The verdict in JSON. Raises UserError where it is none."""
+    """The verdict in JSON. Raises UserError if it is none."""
     try:
         return SubmittedVerdict.model_validate_json(content)
     except ValidationError as error:
@@ -89,7 +89,7 @@ def drawn_boxes(
 ) -> tuple[dict[int, Float[np.ndarray, "4"]], tuple[int, int]]:
     """The boxes by frame, and the capture times of the first and the last frame, ns.
 
-    Raises UserError without any, and where one is empty.
+    Raises UserError without boxes, and for an empty box.
     """
     if not boxes:
         raise UserError("verdict: expected a box around the fish; draw one on a frame of the clip")
@@ -113,7 +113,7 @@ def require_database(report: RunReport) -> Path:
 
 
 class VerdictRecorder:
-    """Verdicts of one reviewer on the fish of one run. Thread-safe."""
+    """Verdicts of a reviewer on the fish of a run. Thread-safe."""
 
     def __init__(self, report: RunReport, reviewer: str, *, blind: bool = False) -> None:
         """UserError without a database to write to.
@@ -133,7 +133,7 @@ class VerdictRecorder:
     def record(self, submitted: SubmittedVerdict) -> list[int]:
         """Check and write a verdict; returns the fish that it changes.
 
-        UserError where it contradicts itself or what is known; DoubtError where it may be right.
+        UserError if it contradicts itself or known facts; DoubtError if it may be right.
         """
         with self._lock:
             said = read_verdicts(self._database)
@@ -166,17 +166,17 @@ class VerdictRecorder:
         with self._lock:
             verdicts = read_verdicts(self._database)
             self._follow(verdicts)
-            named = {one.track_id for one in verdicts} | {one.other_fish for one in verdicts}
-            return self.report, self._reviews(verdicts), {one for one in named if one is not None}
+            named = {number for v in verdicts for number in (v.track_id, v.other_fish)}
+            return self.report, self._reviews(verdicts), {n for n in named if n is not None}
 
     def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
-        """Of this reading: a blind reader sees no other verdicts."""
+        """The reviews of this reading: a blind reader sees no other verdicts."""
         if self._reading is None:
             return reviews_of(verdicts)
         return reviews_of(blind_readings(verdicts).get(self._reviewer, []))
 
     def _follow(self, verdicts: Sequence[Verdict]) -> None:
-        """Take over what any reviewer has added, split, merged or undone."""
+        """Apply all edits of any reviewer: added, split, merged and undone."""
         if self._reading is not None:
             return
         changed = changed_fish(self.report.edits, edits_of(verdicts))
@@ -210,17 +210,17 @@ class VerdictRecorder:
             )
         reviews = self._reviews(said)
         measured = {
-            one.estimate.track_id: one.estimate
-            for one in report.fish
+            fish.estimate.track_id: fish.estimate
+            for fish in report.fish
             if not submitted.sure
-            and one.estimate.ci95_mm is not None
-            and reviews.get(one.estimate.track_id, NOT_REVIEWED).decision not in NOT_COUNTED
+            and fish.estimate.ci95_mm is not None
+            and reviews.get(fish.estimate.track_id, NOT_REVIEWED).decision not in NOT_COUNTED
         }
         if verdict.kind == "add":
             boxes, time_ns = drawn_boxes(submitted.boxes)
             self._editor.require_free(report, boxes, time_ns, measured)
             return self._editor.add(report, verdict, boxes, time_ns)
-        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
+        there = {fish.estimate.track_id for fish in report.fish} - report.edits.merged.keys()
         check_verdict(verdict, there, reviews)
         if verdict.kind in EDITS:
             _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
@@ -238,7 +238,7 @@ class VerdictRecorder:
                 return TrackEdit(verdict=verdict)
 
     def _undo(self, verdict: Verdict, said: Sequence[Verdict]) -> Verdict:
-        """Take back the last verdict of this reviewer. UserError where others build on it."""
+        """Take back the last verdict of this reviewer. UserError if others build on it."""
         number = last_of(said, self._reviewer, self._reading)
         if number is None:
             raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
@@ -300,9 +300,9 @@ class VerdictRecorder:
 
 def _require_unmoved(reviews: Mapping[int, Review], *fish: int | None) -> None:
     """Points that were moved are of a fish as it was: UserError before it gets other frames."""
-    for one in fish:
-        if one is not None and reviews.get(one, NOT_REVIEWED).moved:
+    for number in fish:
+        if number is not None and reviews.get(number, NOT_REVIEWED).moved:
             raise UserError(
-                f"verdict: expected a fish without moved points, but fish {one} has some; "
+                f"verdict: expected a fish without moved points, but fish {number} has some; "
                 "withdraw its verdicts first"
             )

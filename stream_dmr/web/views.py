@@ -42,7 +42,7 @@ _OVERSAMPLING = 2  # of the crop's pixels, for the outline of a mesh
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Outlines:
-    """What is drawn over a crop, in its pixels, whose centres are integers."""
+    """Lines and points to draw over a crop, in its pixels, whose centres are integers."""
 
     mask: Sequence[Float[np.ndarray, "_ 2"]]
     mesh: Sequence[Float[np.ndarray, "_ 2"]]
@@ -108,10 +108,10 @@ def draw_outlines(
 def frame_images(
     recording: Recording, wanted: set[int], source: str | None, *, is_given: bool
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """The images of the wanted frames, from `source`, or from the recording where it has any.
+    """The images of the wanted frames, from `source`, or from the recording if it has any.
 
-    A source that is not the recorded one raises SourceError where it `is_given` by the user; else
-    its frames are left out.
+    A source other than the recorded one raises SourceError if it `is_given` by the user; else its
+    frames are left out.
     """
     checked = nullcontext() if is_given else suppress(SourceError)
     if source is None:
@@ -129,7 +129,7 @@ def frame_images(
 
 
 def recorded_source(recording: Recording) -> str | None:
-    """Path of the recorded source, where there is still a file or folder."""
+    """Path of the recorded source, if there is still a file or folder."""
     inputs = recording.header.known_inputs
     return inputs.source.path if inputs is not None and inputs.source.exists() else None
 
@@ -139,7 +139,7 @@ _Key = tuple[int, int]  # frame index, track id
 
 @dataclass(frozen=True, kw_only=True)
 class FishFrame:
-    """One fish in one frame: its own length, and the running estimate after it."""
+    """A fish in a frame: its length by that frame, and the running estimate after it."""
 
     fish: LocalizedFish
     estimate: LengthEstimate
@@ -147,7 +147,7 @@ class FishFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedView:
-    """One fish in one frame with its crop and fit, encoded: a season of masks fills no memory."""
+    """A fish in a frame with its crop and fit, encoded: a season of masks fits into memory."""
 
     crop: bytes
     fit: bytes
@@ -156,9 +156,9 @@ class RecordedView:
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
-        """For sorting; the best view is the largest.
+        """The key for sorting; the best view is the largest.
 
-        Used frames come first, then those that the recording has a picture of, then by their IoU.
+        Used frames come first, then frames with a picture in the recording, then by their IoU.
         """
         return self.row.estimate.is_frame_used, self.has_picture, self.row.fish.iou or 0.0
 
@@ -169,7 +169,7 @@ class RecordedView:
 
 @dataclass(kw_only=True)
 class RecordedTrack:
-    """All frames of one fish, and its best views."""
+    """All frames of a fish, and its best views."""
 
     rows: list[FishFrame] = field(default_factory=list[FishFrame])
     views: list[RecordedView] = field(default_factory=list[RecordedView])  # the best first
@@ -223,7 +223,7 @@ _WEBP_QUALITY = 75  # half the bytes of a JPEG that looks the same
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnView:
-    """The pictures and outlines of one fish in one frame."""
+    """The pictures and outlines of a fish in a frame."""
 
     recorded: RecordedView
     crop_camera: Camera  # the outlines are in its pixels
@@ -247,10 +247,10 @@ def draw_views(
 ) -> DrawnViews:
     """Draw the views of all tracks, with the pictures of `source` or of the recording.
 
-    Without `source`, the recorded one is tried. With `pictures`, which find a frame without
-    reading all before it, nothing else is read; so a video that was recorded is searched. Fish
-    without a picture are drawn by their masks. Raises SourceError where a given `source` is not the
-    recorded one.
+    Without `source`, the recorded source is tried. With `pictures`, which find a frame without
+    reading all before it, nothing else is read; so a recorded video is searched. Fish without a
+    picture are drawn by their masks. Raises SourceError if a given `source` is not the recorded
+    one.
     """
     path = recorded_source(recording) if pictures is None and source is None else None
     if path is not None and Path(path).is_file():
@@ -267,7 +267,7 @@ def draw_views(
         images = frame_images(recording, set(waiting), of, is_given=source is not None)
     else:
         times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
-        found = (one.frame for t in sorted(times) for one in pictures.frames((t, t + 1)))
+        found = (shown.frame for t in sorted(times) for shown in pictures.frames((t, t + 1)))
         images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
     without = ((frame_index, None) for frame_index in list(waiting))
     for frame_index, image in chain(images, without):  # the first that has a frame draws it

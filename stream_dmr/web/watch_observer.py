@@ -28,16 +28,16 @@ from stream_dmr.web.run_state import RunState
 from stream_dmr.web.watch_page import WatchServer
 
 _REPEAT_INTERVAL_S = 60.0
-_MAX_KINDS = 200  # of lines that are remembered; beyond it, the one that was silent longest goes
+_MAX_KINDS = 200  # of lines that are remembered; beyond it, the longest silent kind is dropped
 _PROGRESS_INTERVAL_S = 60.0
-_Kind = tuple[object, ...]  # what makes lines equal: event, text and fish
+_Kind = tuple[object, ...]  # event, text and fish, by which lines are equal
 _FISH_FACTS = ("track_id", "length_mm", "length_std_mm", "frames_used", "frames_seen", "status")
 
 
 class JsonLog(RunObserver):
-    """Logs the events of a run as JSON on stderr, for a service's log; equal ones once a minute.
+    """Logs the events of a run as JSON on stderr, for a service's log; equal events once a minute.
 
-    The next that is logged counts those held back.
+    The next line counts the events held back.
     """
 
     needs_pictures = False
@@ -72,7 +72,7 @@ class JsonLog(RunObserver):
 
     def _log_event(self, level: str, event: str, **facts: object) -> None:
         kind, now_s = (event, facts.get("text"), facts.get("track_id")), time.monotonic()
-        with self._lock, suppress(OSError):  # nobody reads the log: the run goes on
+        with self._lock, suppress(OSError):  # if nobody reads the log, the run continues
             if now_s - self._passed_s.get(kind, -_REPEAT_INTERVAL_S) < _REPEAT_INTERVAL_S:
                 self._held_back[kind] = self._held_back.get(kind, 0) + 1
                 return
@@ -121,7 +121,7 @@ class SystemdWatchdog:
 
 
 def notify(line: str) -> None:
-    """Send a line to systemd, where it started this process."""
+    """Send a line to systemd, if it started this process."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
@@ -131,7 +131,7 @@ def notify(line: str) -> None:
 
 
 class WatchObserver(RunObserver):
-    """Passes everything on to another observer, serves it, and tells systemd that the run lives."""
+    """Passes all events to another observer, serves them, and reports to systemd that it lives."""
 
     def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
@@ -142,7 +142,7 @@ class WatchObserver(RunObserver):
         self._opened = ExitStack()
 
     def open(self, inputs: Inputs, store: LengthStore, hauls: HaulLog, sinks: SinkStates) -> None:
-        """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
+        """Serve as set in `[watch]`; ConfigError or OutputError if it can't listen there."""
         self._observer.open(inputs, store, hauls, sinks)
         config, out = inputs.config, inputs.request.out
         settings = config.watch

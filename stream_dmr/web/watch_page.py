@@ -64,7 +64,7 @@ def _write_label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int,
         cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, thickness, cv2.LINE_AA)
 
 
-_PICTURE_INTERVAL_S = 0.5  # one picture for all who ask meanwhile: measuring must not slow down
+_PICTURE_INTERVAL_S = 0.5  # all requests in it share a picture: measuring must not slow down
 _MIN_TOKEN_CHARACTERS = 16
 
 
@@ -75,7 +75,7 @@ class WatchServer(TokenServer):
     setting = "host or port of [watch]"
 
     def __init__(self, state: RunState, settings: WatchSettings) -> None:
-        """ConfigError where others could read along without a token; OutputError for the port."""
+        """ConfigError if others could read along without a token; OutputError for the port."""
         self._state = state
         registry = make_registry(state)
         self._picture_lock = threading.Lock()
@@ -127,7 +127,7 @@ def _page(name: str) -> Response:
 
 
 def _read_token(settings: WatchSettings) -> str:
-    """The token that readers need; "" where the server is for this machine alone."""
+    """The token that readers need; "" if the server is for this machine alone."""
     if not settings.token_file:
         if is_loopback(settings.host):
             return ""
@@ -151,7 +151,7 @@ def zones_json(state: RunState) -> dict[str, Any]:
 
 
 def health_json(state: RunState) -> dict[str, Any]:
-    """Whether a run is healthy, why not, what it warned of, and how each of its outputs is."""
+    """The health of a run, its problems and warnings, and the state of each of its outputs."""
     problems = state.problems()
     sinks = [
         {
@@ -172,7 +172,7 @@ def health_json(state: RunState) -> dict[str, Any]:
 
 
 def positions_json(state: RunState) -> dict[str, Any] | None:
-    """The last position, and what came from the receiver; None of a run without positions."""
+    """The last position, and counts of the receiver; None for a run without positions."""
     if state.positions is None:
         return None
     last, counts = state.position, state.positions.counts
