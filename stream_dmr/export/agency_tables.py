@@ -1,6 +1,6 @@
 """Tables in the manner of WCPFC's longline monitoring and of ICES' RDBES; docs/trip.md maps them.
 
-What a camera can't know stays empty: nothing is guessed. Sources: draft longline EM fields
+Fields that a camera can't know stay empty: nothing is guessed. Sources: draft longline EM fields
 (WCPFC-SC16-2020/ST-IP-07) and the SPC/FFA longline observer form; the types and code lists of RDBES
 (BaseTypes.xsd of February 2025, Enumerators.zip).
 """
@@ -93,7 +93,7 @@ def rdbes_row(fish: Fish, template: Template) -> Row:
 
 
 def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
-    """One haul with its effort; `utc_zero_ns` added to capture times gives UTC."""
+    """A haul with its effort; capture time plus `utc_zero_ns` is UTC."""
 
     def utc(time_ns: int | None) -> str:
         if time_ns is None or utc_zero_ns is None:

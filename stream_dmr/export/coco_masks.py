@@ -1,7 +1,7 @@
-"""Masks as COCO JSON with run lengths, and head and tail, in the pixels of their frames.
+"""Write masks as COCO JSON with run lengths, and head and tail, in the pixels of their frames.
 
-Beside cocodataset.org's "Data format" there are the ids of COCO-VID, as MMTracking's `CocoVID`
-reads them: a run is one video, whose frames count from 0.
+Beside cocodataset.org's "Data format" there are the ids of COCO-VID, for MMTracking's `CocoVID`: a
+run is a video whose frames count from 0.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,9 +30,9 @@ def coco_masks(
 ) -> dict[str, Any]:
     """COCO's object; `pictures` with frame index and source, `fish` by track id.
 
-    Categories are the codes of species, and "fish" where there is none.
+    Categories are the codes of species, and "fish" without a code.
     """
-    codes = {track_id: one.sure_code for track_id, one in fish.items() if one.counts}
+    codes = {track_id: known.sure_code for track_id, known in fish.items() if known.counts}
     names = ["fish", *sorted({code for code in codes.values() if code})]
     annotations = list[dict[str, Any]]()
     for number, (crop, located) in enumerate(seen, start=1):
@@ -70,9 +70,9 @@ def coco_masks(
 def _ends(
     crop: FishCrop, located: LocalizedFish | None, fish: Fish | None
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Head and tail where a reviewer put them, else as fitted; None without, and if refused.
+    """Head and tail by a reviewer, else by the fit; None without a fit, and in refused frames.
 
-    `train` would learn from those of a refused frame.
+    `train` would learn from the ends of a refused frame.
     """
     placed = None if fish is None else fish.review.moved.get(crop.frame_index)
     if placed is not None:
@@ -91,7 +91,7 @@ def is_picture(source: str) -> bool:
 def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
     """The mask of a crop in the pixels of its frame.
 
-    A frame pixel belongs to it where the crop's mask, interpolated, is above one half: a crop is
+    A frame pixel belongs to it if the crop's mask, interpolated, is above one half: a crop is
     coarser than its frame, and its nearest pixel would leave steps along the outline.
     """
     frame = crop.frame_camera

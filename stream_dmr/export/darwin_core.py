@@ -13,7 +13,7 @@ from stream_dmr.tables import utc_text
 from stream_dmr.template.template import Template
 
 FishTable = tuple[Sequence[str], Callable[[Fish, Template], list[dict[str, Any]]]]
-"""Columns, and the rows of a fish, which lack the empty ones."""
+"""Columns, and the rows of a fish, without empty values."""
 
 _OCCURRENCE = [
     *("occurrenceID", "eventDate", "decimalLatitude", "decimalLongitude", "geodeticDatum"),
@@ -72,7 +72,7 @@ def measurement_rows(fish: Fish, template: Template) -> list[dict[str, Any]]:
     for kind, (value_mm, source) in found.items():
         converted = f", converted by {source or 'the ratio of its body form'}"
         ci95_mm = _ci95_mm(fish) if kind == given else None
-        term = "TL01XX01" if kind == "total" else "OBSINDLX"  # the total one, or any length
+        term = "TL01XX01" if kind == "total" else "OBSINDLX"  # the total length, or any length
         row = {
             "occurrenceID": fish_id(fish),
             "measurementType": kind if kind == "disc width" else f"{kind} length".strip(),
@@ -145,6 +145,6 @@ def archive_description() -> str:
 
 
 def _ci95_mm(fish: Fish) -> list[float] | None:
-    """That of the measured length; None where a reviewer's stands in its place."""
+    """The interval of the measured length; None if a reviewer's length replaces it."""
     ci95_mm = fish.estimate.ci95_mm
     return None if ci95_mm is None or fish.review.length_mm is not None else ci95_mm.tolist()

@@ -58,7 +58,7 @@ class Export:
     def __init__(
         self, recording: Path, selection: Selection = EVERYTHING, *, overwrite: bool = False
     ) -> None:
-        """With `overwrite`, existing files are replaced, except for those of a run."""
+        """With `overwrite`, existing files are replaced, except for files of a run."""
         self._path = recording
         self._database = database_of(recording)
         self.recording = open_results(recording)
@@ -68,17 +68,17 @@ class Export:
         self._written: list[Path] = []
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
-        self._new: list[Path] = []  # files and folders that were not there, and no provenance knows
-        self.notes: list[str] = []  # what is missing in the exports so far, one line each
+        self._new: list[Path] = []  # files and folders made here, not yet in a provenance
+        self.notes: list[str] = []  # what the exports so far lack, one line each
         self._require_selected()
 
     @contextmanager
     def into(self, out: Path) -> Generator[None]:
         """The exports of the block go into `out`; provenance.json has their inputs and checksums.
 
-        An error or a signal removes what the block wrote, so that the same command can be given
-        again; files that were replaced stay as they are then. OutputError where `out` holds exports
-        of another recording.
+        An error or a signal removes the files of the block, so that the same command can be given
+        again; replaced files stay as they are then. OutputError if `out` holds exports of another
+        recording.
         """
         origin = read_origin(out)
         if origin is not None and origin.resolve() != self._path.resolve():
@@ -123,11 +123,14 @@ class Export:
         """Write masks, head and tail as COCO JSON; returns the number of masks.
 
         They are in the pixels of the frame, lens distortion included. Frames without fish are
-        listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
-        Rejected fish and doubles are left out: `train` would learn from them.
+        listed too. Categories are the FAO codes of the fish, and "fish" without a code. Rejected
+        fish and duplicates are left out: `train` would learn from them.
         """
         self._require_writable(path, needed_for="--masks")
-        placed = {(one.track_id, one.frame_index): one for one in self._reviewed.of(LocalizedFish)}
+        placed = {
+            (placed.track_id, placed.frame_index): placed
+            for placed in self._reviewed.of(LocalizedFish)
+        }
         coco = coco_masks(
             (
                 (frame.frame_index, frame.source, stored_picture(payload))
@@ -139,7 +142,7 @@ class Export:
                 for crop in self._reviewed.of(FishCrop)
                 if crop.track_id not in self._left_out
             ),
-            {one.estimate.track_id: one for one in self._fish},
+            {fish.estimate.track_id: fish for fish in self._fish},
             video=self.header.source,
         )
         with self._writing(path):
@@ -149,8 +152,8 @@ class Export:
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
         """Write lengths and frames (keypoints, one row per fish and frame) into `out`, as `run`.
 
-        Fish that reviewers added, split or merged have the frames that they have since. Lengths
-        are those of lengths.db, where there is one: of a camera, old segments may be deleted.
+        Fish that reviewers added, split or merged have their present frames. Lengths are those of
+        lengths.db, if there is one: old segments of a camera may be deleted.
         """
         paths = [out / "lengths.csv", out / "frames.csv"]
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
@@ -167,12 +170,12 @@ class Export:
                 frames.write(make_record(running[message.frame_index], RecordingSettings()))
         frames.close()
         fish = [] if self._database is None else self._fish
-        kept = {one.estimate.track_id: one.estimate for one in fish}
+        kept = {caught.estimate.track_id: caught.estimate for caught in fish}
         finished = [
             *(estimate for track_id, estimate in kept.items() if track_id not in edits.merged),
-            *(one for one in finished if one.track_id not in kept),
+            *(caught for caught in finished if caught.track_id not in kept),
         ]
-        flags = {one.estimate.track_id: one.flags for one in fish}
+        flags = {caught.estimate.track_id: caught.flags for caught in fish}
         write_lengths(out / "lengths.csv", finished, flags)
         if format == "parquet":
             from pyarrow import csv, parquet
@@ -199,7 +202,7 @@ class Export:
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        records = [fish_record(one, self.header.template, settings, checks) for one in self._fish]
+        records = [fish_record(fish, self.header.template, settings, checks) for fish in self._fish]
         self.notes += unweighed_note(records, settings)
         with self._writing(path):
             if format == "csv":
@@ -209,19 +212,21 @@ class Export:
         return path
 
     def viame(self, path: Path) -> int:
-        """Write boxes, outlines and what is known of each fish as VIAME CSV, for DIVE.
+        """Write boxes, outlines and the facts of each fish as VIAME CSV, for DIVE.
 
-        Returns the number of boxes. Rejected fish and doubles are left out.
+        Returns the number of boxes. Rejected fish and duplicates are left out.
         """
         self._require_writable(path, needed_for="--viame")
         frames = messages_of(self.recording, Frame, self._selection)
         steps = np.diff(np.array([frame.timestamp_ns for frame in frames], np.int64))
         text, count = viame_csv(
             self._counted(),
-            {one.estimate.track_id: one for one in self._fish},
+            {fish.estimate.track_id: fish for fish in self._fish},
             self.header.template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
-            pictures={one.frame_index: one.source for one in frames if is_picture(one.source)},
+            pictures={
+                frame.frame_index: frame.source for frame in frames if is_picture(frame.source)
+            },
             is_part=not self._selection.is_everything,
         )
         with self._writing(path):
@@ -246,9 +251,13 @@ class Export:
 
     def agency(self, out: Path, agency: Agency) -> list[Path]:
         """Write the tables of AGENCIES; rejected fish and doubles are left out."""
-        fish = [(one, template_of(one, self.header.template)) for one in self._fish if one.counts]
+        fish = [
+            (caught, template_of(caught, self.header.template))
+            for caught in self._fish
+            if caught.counts
+        ]
         tables = {
-            out / name: (columns, [row for one in fish for row in rows_of(*one)])
+            out / name: (columns, [row for entry in fish for row in rows_of(*entry)])
             for name, (columns, rows_of) in AGENCIES[agency].items()
         }
         meta = [out / "obis" / "meta.xml"] if agency is Agency.OBIS else []
@@ -273,11 +282,13 @@ class Export:
                 f"{self._path}: expected the folder of a run, which has a lengths.db; give that"
             )
         self._require_writable(path)
-        efforts = read_effort(database, [one for one in self._fish if one.counts])
+        efforts = read_effort(database, [fish for fish in self._fish if fish.counts])
         zeros = {facts.utc_zero_ns for facts in read_runs(database).values()}
         zero_ns = zeros.pop() if len(zeros) == 1 else None
         with self._writing(path):
-            write_csv(path, HAUL_COLUMNS, [haul_row(one, utc_zero_ns=zero_ns) for one in efforts])
+            write_csv(
+                path, HAUL_COLUMNS, [haul_row(effort, utc_zero_ns=zero_ns) for effort in efforts]
+            )
         return path
 
     @cached_property
@@ -287,23 +298,23 @@ class Export:
     @cached_property
     def _left_out(self) -> set[int]:
         """Track ids of rejected fish and of doubles."""
-        return {one.estimate.track_id for one in self._fish if not one.counts}
+        return {fish.estimate.track_id for fish in self._fish if not fish.counts}
 
     def _require_selected(self) -> None:
-        """Refuse a recording or a selection of nothing; lengths.db may know more fish than it."""
+        """Refuse an empty recording or selection; lengths.db may have more fish than it."""
         if self._database is None:
             require_messages(self.recording)
         if self._selection.is_everything:
             return
-        fish = {one.estimate.track_id for one in self._fish}
+        fish = {fish.estimate.track_id for fish in self._fish}
         if not fish:
             require_time(self.recording, self._selection)
         if self._selection.tracks is not None:
-            fish |= {one.track_id for one in self._reviewed.of(LocalizedFish)}
+            fish |= {seen.track_id for seen in self._reviewed.of(LocalizedFish)}
             require_tracks(self._selection, fish)
 
     def _require_writable(self, *paths: Path, needed_for: str = "") -> None:
-        """UserError where a file may not be written, or an option needs a lost recording."""
+        """UserError if a file may not be written, or an option needs a lost recording."""
         if needed_for:
             require_recording(self.recording, where=self._path, what=needed_for)
         require_writable(*paths, overwrite=self._overwrite, is_own=self._earlier.__contains__)
@@ -320,7 +331,7 @@ class Export:
     def _counted(self) -> Iterator[tuple[FishCrop, LocalizedFish]]:
         """Each crop of the fish that count, with its place."""
         seen = self._localized(FishCrop)
-        return (one for one in seen if one[0].track_id not in self._left_out)
+        return (pair for pair in seen if pair[0].track_id not in self._left_out)
 
     def _localized(self, kind: type[Stage]) -> Iterator[tuple[Stage, LocalizedFish]]:
         """Each crop or fit with the place of its fish."""

@@ -1,4 +1,4 @@
-"""fish.csv (or .parquet): one row per fish with all that fisheries and auditors need of it."""
+"""fish.csv (or .parquet): a row for each fish with all that fisheries and auditors need."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,14 +17,14 @@ from stream_dmr.template.template import Template
 
 
 class _Row(NamedTuple):
-    """What the columns of one fish are made of."""
+    """The sources of the columns of a fish."""
 
     fish: Fish
     template: Template
     settings: FisheriesSettings
     species: str  # "": neither a reviewer nor a classifier said it
     derived: Derived
-    check: ScaleCheck | None  # the last one with the calibration of its run
+    check: ScaleCheck | None  # the last check with the calibration of its run
 
     @property
     def ci95_mm(self) -> list[Any]:
@@ -56,7 +56,7 @@ _COLUMNS: dict[str, _Column] = {
     "species": (str, lambda row: row.species or row.template.name),
     **_same(str, "fish", "species_code", "fate"),
     **_same(str, "fish.estimate", "status"),
-    # What a reviewer says has no share.
+    # A reviewer's species has no share.
     "species_share": (
         float,
         lambda row: None if row.fish.review.species else row.fish.estimate.species_share,
@@ -122,9 +122,9 @@ def fish_record(
     settings: FisheriesSettings,
     checks: Mapping[str, ScaleCheck] | None = None,
 ) -> dict[str, Any]:
-    """The values of FISH_TABLE; None where there is none.
+    """The values of FISH_TABLE; None for missing values.
 
-    `checks`: the last ones of the scale, by the SHA-256 of their calibration.
+    `checks`: the last checks of the scale, by the SHA-256 of their calibration.
     """
     template = template_of(fish, template)
     found = fish.species
@@ -137,7 +137,7 @@ def fish_record(
 
 
 def used_columns(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The columns of lengths.csv, and those in which a fish has something."""
+    """The columns of lengths.csv, and all columns in which a fish has a value."""
     return [
         name
         for name in FISH_TABLE
@@ -147,7 +147,7 @@ def used_columns(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
-    """A line where weight or legal size are asked for, and no fish is of their species."""
+    """A line if weight or legal size are asked for, and no fish is of their species."""
     species = sorted({record["species"] for record in records if record["length_mm"] is not None})
     is_asked = settings.weight_a > 0 or settings.legal_cm > 0
     if not is_asked or not species or any(is_same_species(s, settings.species) for s in species):
@@ -160,12 +160,12 @@ def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSetting
 
 
 def write_csv(path: Path, columns: Iterable[str], records: Iterable[Mapping[str, Any]]) -> None:
-    """Write a table; lengths are rounded as in lengths.csv, what a record lacks stays empty."""
-    write_table(path, columns, ([cell(one.get(name)) for name in columns] for one in records))
+    """Write a table; lengths are rounded as in lengths.csv, missing values stay empty."""
+    write_table(path, columns, ([cell(record.get(name)) for name in columns] for record in records))
 
 
 def write_parquet(path: Path, columns: Mapping[str, type], records: list[dict[str, Any]]) -> None:
-    """Write a table, exact; what a record lacks is null."""
+    """Write a table, exact; missing values are null."""
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -1,4 +1,4 @@
-"""Tracks as VIAME CSV, which DIVE reads: boxes, outlines, head and tail, length, species.
+"""Write tracks as VIAME CSV, for DIVE: boxes, outlines, head and tail, length, species.
 
 The columns are those of VIAME's `write_object_track_set_viame_csv` and of DIVE's reader: track,
 time or picture, frame from 0, box, confidence, length or -1, species and its confidence, and then
@@ -27,7 +27,7 @@ _HEADER = (
     "9: Target Length (0 or -1 if invalid),10-11+: Repeated Species,Confidence Pairs or Attributes"
 )
 NO_LENGTH, NO_SPECIES = -1, "fish"
-PART = "(trk-atr) exported part"  # DIVE keeps it, unlike what the metadata line has
+PART = "(trk-atr) exported part"  # DIVE keeps it, unlike the content of the metadata line
 _OF_TRACK = (  # columns of fish.csv
     *("length_mm", "ci95_low_mm", "ci95_high_mm", "length_type", "length_from", "frames_used"),
     *("status", "flags", "species", "species_code", "species_share", "fate", "fate_share"),
@@ -45,18 +45,18 @@ def viame_csv(
     pictures: Mapping[int, str],
     is_part: bool = False,
 ) -> tuple[str, int]:
-    """The file and the number of its boxes; `fish` by track id, `fps` None where not known.
+    """The file and the number of its boxes; `fish` by track id, `fps` None if unknown.
 
-    `pictures`: names by frame index, of a folder of pictures. What is known of a track stands in
-    its first row; with `is_part`, that other fish or frames of the run are left out, as well.
+    `pictures`: names by frame index, of a folder of pictures. The facts of a track are in its first
+    row; with `is_part` also that other fish or frames of the run are left out.
     """
     rows, text, told = list[list[object]](), StringIO(), set[int]()
     for crop, located in seen:
-        one = fish.get(located.track_id)
-        row = _row(crop, located, one, pictures.get(located.frame_index))
+        known = fish.get(located.track_id)
+        row = _row(crop, located, known, pictures.get(located.frame_index))
         if located.track_id not in told:
             told.add(located.track_id)
-            record = {} if one is None else fish_record(one, template, FisheriesSettings())
+            record = {} if known is None else fish_record(known, template, FisheriesSettings())
             row += _attributes("trk-atr", {name: record.get(name) for name in _OF_TRACK})
             row += [PART] if is_part else []
         rows.append(row)
@@ -69,7 +69,7 @@ def viame_csv(
 
 
 def species_name(fish: Fish | None) -> str:
-    """What it is as far as somebody knows, else NO_SPECIES."""
+    """The species by a reviewer, else by a sure classifier, else NO_SPECIES."""
     return (fish.review.species or fish.sure_code if fish else "") or NO_SPECIES
 
 

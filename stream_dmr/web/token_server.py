@@ -81,6 +81,7 @@ class TokenServer(ThreadingHTTPServer):
     max_connections = 32
     request_timeout_s = 5.0  # until the headers are there
     answer_timeout_s = 30.0  # from there on
+    closing_timeout_s = 1.0  # for the thread of a connection that makes room to close it
     max_body_bytes = 1 << 16
     setting = "host or port"  # to name in an error, if the address can't be had
 
@@ -93,7 +94,7 @@ class TokenServer(ThreadingHTTPServer):
     ) -> None:
         """Raises OutputError if it can't have the address."""
         self.routes, self.token = routes, token
-        self._lock = threading.Lock()
+        self._closed = threading.Condition()  # notified of each closed connection
         self._connections = set[socket.socket]()
         self._strangers: dict[socket.socket, bool] = {}  # whether local; in their order
         try:
@@ -124,8 +125,8 @@ class TokenServer(ThreadingHTTPServer):
         If there are too many, the oldest that has sent no request with the token makes room, first
         those of other machines; if all have sent one, the new connection is closed.
         """
-        with self._lock:
-            is_busy = len(self._connections) >= self.max_connections and not self._end_stranger()
+        with self._closed:
+            is_busy = not self._has_room() and not self._make_room()
             if not is_busy:
                 self._connections.add(request)
                 self._strangers[request] = is_loopback(client_address[0])
@@ -147,23 +148,27 @@ class TokenServer(ThreadingHTTPServer):
 
     def admit(self, request: socket.socket) -> None:
         """Keep a connection for good: it has sent a request with the token."""
-        with self._lock:
+        with self._closed:
             self._strangers.pop(request, None)
 
-    def _end_stranger(self) -> bool:
+    def _has_room(self) -> bool:
+        return len(self._connections) < self.max_connections
+
+    def _make_room(self) -> bool:
+        """End the oldest stranger's connection, and wait until its descriptor is free."""
         oldest = min(self._strangers, key=self._strangers.__getitem__, default=None)
         if oldest is None:
             return False
         del self._strangers[oldest]
-        self._connections.discard(oldest)
         with suppress(OSError):
             oldest.shutdown(socket.SHUT_RDWR)
-        return True
+        return self._closed.wait_for(self._has_room, self.closing_timeout_s)
 
     def _forget(self, request: socket.socket) -> None:
-        with self._lock:
+        with self._closed:
             self._connections.discard(request)
             self._strangers.pop(request, None)
+            self._closed.notify()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print a traceback, but not for a reader who left."""
