@@ -170,7 +170,7 @@ class Table:
 _Columns = Mapping[str, tuple[str, bool]]
 """Type of each column, and whether it may be missing."""
 
-RUNS = Table("runs", order="started_ns", kind="run")
+RUNS = Table("runs", order="rowid", kind="run")
 FISH = Table("fish", kind="fish")
 EVENTS = Table("events", kind="event")
 HAULS = Table("hauls", kind="haul")

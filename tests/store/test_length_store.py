@@ -125,6 +125,16 @@ def test_a_database_from_before_a_column_is_read_and_gone_on_with(store: LengthS
     assert list(read_runs(store.path).values()) == [FACTS, replace(facts, ended_by="a test")]
 
 
+def test_runs_are_in_the_order_in_which_they_began_whatever_the_clock_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name, now_ns in (("first", 3), ("second", 1), ("third", 2)):
+        monkeypatch.setattr("time.time_ns", lambda now_ns=now_ns: now_ns)
+        LengthStore(tmp_path, replace(FACTS, command=name)).close()
+    found = read_runs(tmp_path / "lengths.db")
+    assert [facts.command for facts in found.values()] == ["first", "second", "third"]
+
+
 def test_a_database_of_the_first_tables_is_read_and_gone_on_with(store: LengthStore):
     store.add(fish(1))
     store.close()
