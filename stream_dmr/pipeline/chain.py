@@ -1,8 +1,8 @@
 """Runs the chain of nodes: one thread each, bounded queues between them, shutdown, counters.
 
-All messages of a frame travel together as one batch, frames without fish as an empty one. So every
-stage works in the order of the source, and a shutdown cuts between frames. A TrackEnded travels
-down the whole chain, behind the last message of its fish.
+All messages of a frame travel together as a batch, which is empty for a frame without fish. So
+every stage works in the order of the source, and a shutdown cuts between frames. A TrackEnded
+travels down the whole chain, behind the last message of its fish.
 """
 
 import queue
@@ -34,7 +34,7 @@ class Node(Protocol):
         ...
 
     def close(self) -> Sequence[Message]:
-        """The stream has ended: return what remains."""
+        """Return what remains at the end of the stream."""
         ...
 
 
@@ -43,7 +43,7 @@ class EndsTracks(Protocol):
     """A node that has something left to return when a track ends."""
 
     def end(self, ended: TrackEnded, /) -> Sequence[Message]:
-        """No later message of this fish will come: return what remains of it."""
+        """Return what remains of a fish of which no later message will come."""
         ...
 
 
@@ -52,7 +52,7 @@ class EndsAtPause(Protocol):
     """A node whose tracks end if the source pauses for long."""
 
     def pause(self) -> Sequence[Message]:
-        """No frame comes for a long time: return what remains of the open tracks."""
+        """Return what remains of the open tracks, since no frame comes for a long time."""
         ...
 
 
@@ -64,7 +64,7 @@ class StageCounters:
     frames_in: int = 0
     frames_processed: int = 0
     frames_dropped: int = 0  # not begun, or not finished, at a stop
-    frames_failed: int = 0  # with an exception; messages made before it went on
+    frames_failed: int = 0  # with an exception; messages made before it are passed on
     messages_in: int = 0
     messages_out: int = 0
     busy_s: float = 0.0  # from taking a frame to passing it on; wall time
@@ -101,11 +101,11 @@ def run_chain(
 
     Setting `stop` ends the chain soon: the busiest stage and those before it drop the frames that
     they have not begun, the stages after it finish theirs, and every node is closed. An exception
-    ends the chain in the same way at its stage, and is raised here; where `on_failure` (stage name,
+    ends the chain in the same way at its stage, and is raised here; if `on_failure` (stage name,
     exception) returns True, only the node's current work is lost.
 
-    `in_one_thread` gives the same results. It is three times as fast where all stages are Python,
-    whose threads exclude each other.
+    The results with `in_one_thread` are the same. It is three times as fast if all stages are
+    Python, whose threads exclude each other.
     """
     chain = Chain(
         source, nodes, on_message=on_message, on_frame=on_frame, on_failure=on_failure, stop=stop
@@ -116,7 +116,7 @@ def run_chain(
 
 @dataclass(eq=False)
 class Chain:
-    """One run: stage 0 is the source, stage k the k-th node. Counters may be read at any time."""
+    """A run: stage 0 is the source, stage k the k-th node. Counters may be read at any time."""
 
     source: Iterable[Frame]
     nodes: Sequence[Node]
@@ -132,7 +132,7 @@ class Chain:
         self.counters = [StageCounters(stage=type(stage).__name__) for stage in stages]
         self._busy_since: list[float | None] = [None] * len(self.counters)
         self._is_stopped = False  # has `stop` been seen?
-        self._cut = -1  # the last stage that drops what it has not begun
+        self._cut = -1  # the last stage that drops frames it has not begun
         self._failure: BaseException | None = None
         self._lock = threading.Lock()
 
@@ -223,7 +223,7 @@ class Chain:
         self._pass_on(stage, self._process(stage, node, ending, close=True))
 
     def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
-        """Step through a batch, then close; messages made before an exception go on."""
+        """Step through a batch, then close; messages made before an exception are passed on."""
         made, is_done = _Batch(kind=batch.kind), True
         with self._busy(stage):
             for message in batch.messages:
@@ -250,7 +250,7 @@ class Chain:
         return ()
 
     def _attempt(self, stage: int, work: Callable[[], Sequence[Message]], made: _Batch) -> bool:
-        """Do a part of a frame's work; False where it failed, which may end the chain."""
+        """Do a part of a frame's work; False if it failed, which may end the chain."""
         try:
             for message in work():
                 made.messages.append(self.on_message(message))
@@ -277,7 +277,7 @@ class Chain:
             self._count(stage, "dropped", left)
 
     def _take(self, stage: int) -> _Batch | None:
-        """Wait for the next batch of a stage; None once the stage drops what waits."""
+        """Wait for the next batch of a stage; None once the stage drops waiting batches."""
         while not self._is_cut(stage):
             try:
                 return self._inboxes[stage - 1].get(timeout=_POLL_S)
@@ -286,7 +286,7 @@ class Chain:
         return None
 
     def _pass_on(self, stage: int, batch: _Batch) -> None:
-        """Hand a batch to the next stage, or count it as dropped where that takes no more."""
+        """Hand a batch to the next stage, or count it as dropped if that stage takes no more."""
         while stage < len(self.nodes) and not self._is_cut(stage + 1):
             try:
                 return self._inboxes[stage].put(batch, timeout=_POLL_S)
@@ -303,7 +303,7 @@ class Chain:
             self._cut = max(self._cut, stage)
 
     def _is_cut(self, stage: int) -> bool:
-        """True where the chain is ending and this stage drops what it has not begun."""
+        """True if the chain is ending and this stage drops frames it has not begun."""
         if self.stop.is_set() and not self._is_stopped:
             with self._lock:
                 self._is_stopped = True
@@ -339,13 +339,13 @@ def _answer(node: Node, message: Message) -> Sequence[Message]:
     return node.step(message)
 
 
-_MAX_CONSECUTIVE = 100  # failed frames (some 10 s): then it is the run that is broken. Chosen.
+_MAX_CONSECUTIVE = 100  # failed frames (some 10 s), after which the run ends. Chosen.
 
 
 class ErrorPolicy:
     """Decides whether a chain continues after an exception, which then costs one frame.
 
-    A run with an end never does. An endless one does, except after a wrong input, which stays
+    A run with an end never does. An endless run does, except after a wrong input, which stays
     wrong; a full disk (OutputError) may be emptied.
     """
 
@@ -355,7 +355,7 @@ class ErrorPolicy:
         self._num_consecutive = 0
 
     def frame_done(self) -> None:
-        """A frame went through the whole chain, so the chain works."""
+        """Reset the count of failures: a frame went through the whole chain, so the chain works."""
         self._num_consecutive = 0
 
     def continues_after(self, stage: str, error: Exception) -> bool:

@@ -1,7 +1,7 @@
-"""Two runs of the same fish by two cameras as one: which fish are the same, and how late.
+"""Combine two runs of the same fish by two cameras: pair their fish and compare their clocks.
 
 The first camera's recording is replayed from its fits on. A fish that the second camera saw at the
-same moment is placed by both, and the rest as one camera places it.
+same moment is placed by both cameras, any other fish by the first camera alone.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,20 +37,20 @@ from stream_dmr.recording.reading import (
 )
 from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, Topics
 
-_MOST_APART_S = 0.25  # between two pictures of a fish, for what it is between them to be known
-_MOST_OFFSET_S = 10.0  # of the two cameras' clocks, if nothing says better
+_MOST_APART_S = 0.25  # between two pictures of a fish, to interpolate between them
+_MOST_OFFSET_S = 10.0  # of the two cameras' clocks; the range that is searched
 _FRAMES = 12  # of a track that are compared
 _COMPARED = 24  # tracks by which the clocks are compared
 _FEWEST = 3  # frames that two tracks must share to be one fish
-# Of the distance of the two cameras' rays to head and tail, over the fish's length: more is
-# another fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
+# Distance of the two cameras' rays to head and tail, over the fish's length; with more they see two
+# fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
 _MOST_RAYS_APART = 0.06
-# What one camera refuses since it sees no depth, and two need not.
+# Reasons why one camera refuses a frame, since it sees no depth, and two cameras need not.
 _BY_ONE_CAMERA = ("", Reason.TURNED_AWAY, Reason.BENT_TOO_FAR)
-# Of both pictures' residuals, in their stds: more is another fish, or a camera that was moved.
+# Residuals of both pictures, in their stds; with more they show two fish, or a camera was moved.
 _MOST_MISFIT = 4.0
-_LEAST_APART_DEG = 3  # between the cameras, seen from the fish: less tells little of depth
-# Of the rays' distance over the length: what is usual on simulated pairs, and what is worth a word.
+_LEAST_APART_DEG = 3  # between the cameras, seen from the fish; less hardly shows depth
+# Distance of the rays over the length: usual on simulated pairs, and large enough for a warning.
 _RAYS_USUAL, _RAYS_WARN = 0.01, 0.03
 
 
@@ -64,14 +64,14 @@ class FishSightings(NamedTuple):
     length_mm: float
 
     def is_beside(self, others: Iterable["FishSightings"]) -> bool:
-        """True if it was seen before or after each of these: it may be a part of their track."""
+        """True if the fish was seen before or after each of these, so may be the same fish."""
         begin, end = self.times_ns[0], self.times_ns[-1]
-        return all(end < one.times_ns[0] or one.times_ns[-1] < begin for one in others)
+        return all(end < other.times_ns[0] or other.times_ns[-1] < begin for other in others)
 
     def at(self, time_ns: int, calibration: Calibration) -> View | None:
-        """What its camera saw of it at a time, between the frames around it; the poorer one's IoU.
+        """The view of the fish at a time, interpolated between the frames around it.
 
-        None too far from them.
+        Its IoU is the lower of the two. None if these frames are too far apart or away.
         """
         before = max(int(np.searchsorted(self.times_ns, time_ns, side="right")) - 1, 0)
         after = min(int(np.searchsorted(self.times_ns, time_ns)), len(self.times_ns) - 1)
@@ -95,14 +95,14 @@ def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[i
     ratios: dict[int, list[float]] = {}
     ious: dict[int, list[float]] = {}
     lengths: dict[int, list[float]] = {}
-    for one in fish:
-        if one.accepted and one.midline_mm is not None and one.length_mm is not None:
-            midline_px = calibration.camera.project(one.midline_mm)
-            times.setdefault(one.track_id, []).append(one.timestamp_ns)
-            midlines.setdefault(one.track_id, []).append(midline_px)
-            ratios.setdefault(one.track_id, []).append(_length_ratio(one.midline_mm))
-            ious.setdefault(one.track_id, []).append(one.iou or 0.0)
-            lengths.setdefault(one.track_id, []).append(one.length_mm)
+    for frame in fish:
+        if frame.accepted and frame.midline_mm is not None and frame.length_mm is not None:
+            midline_px = calibration.camera.project(frame.midline_mm)
+            times.setdefault(frame.track_id, []).append(frame.timestamp_ns)
+            midlines.setdefault(frame.track_id, []).append(midline_px)
+            ratios.setdefault(frame.track_id, []).append(_length_ratio(frame.midline_mm))
+            ious.setdefault(frame.track_id, []).append(frame.iou or 0.0)
+            lengths.setdefault(frame.track_id, []).append(frame.length_mm)
     return {
         track_id: FishSightings(
             times_ns=np.array(times[track_id]),
@@ -121,10 +121,10 @@ def _length_ratio(midline_mm: Float[np.ndarray, "M 3"]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Pairing:
-    """Which fish of two runs are the same."""
+    """The fish of two runs that are the same."""
 
     offset_s: float  # the second camera's clock minus the first's
-    ids: Mapping[int, Sequence[int]]  # of the second run, by those of the first
+    ids: Mapping[int, Sequence[int]]  # of the second run, by the ids of the first
     apart: float  # of the rays to a fish's ends, over its length: median of all pairs
 
 
@@ -137,8 +137,8 @@ def pair_up(
 ) -> Pairing:
     """Pair the fish, at the offset of the clocks at which most rays meet.
 
-    Every offset up to 10 s is tried in steps of half a frame, then finer around the best. Where one
-    camera's track broke off and went on as another, both are the other camera's fish.
+    Every offset up to 10 s is tried in steps of half a frame, then finer around the best. If one
+    camera's track broke off and continued as another track, both are the other camera's fish.
     """
     chosen = np.unique(np.linspace(0, len(first) - 1, _COMPARED).round().astype(int))
     some = {fish: first[fish] for fish in np.array([*first])[chosen].tolist()}
@@ -148,7 +148,7 @@ def pair_up(
         return float(apart[linear_sum_assignment(apart)].sum())
 
     steps = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, frame_s / 2)
-    best = min(sorted(steps.tolist(), key=abs), key=cost)  # of equals: the clocks agree
+    best = min(sorted(steps.tolist(), key=abs), key=cost)  # of equal costs, the smallest offset
     for step in (frame_s / 4, frame_s / 10, frame_s / 40):
         finer = [best + step * n for n in sorted(range(-4, 5), key=abs)]
         best = min(finer, key=cost)
@@ -176,19 +176,19 @@ def _apart(
     calibrations: tuple[Calibration, Calibration],
     offset_s: float,
 ) -> Float[np.ndarray, "A B"]:
-    """How far apart the rays to the ends of each pair of tracks pass, over the fish's length.
+    """Distance between the rays to the ends of each pair of tracks, over the fish's length.
 
-    At most `_MOST_RAYS_APART`, as of tracks that were not in view at the same time.
+    At most `_MOST_RAYS_APART`, also for tracks that were not in view at the same time.
     """
     R, t = second_from_first(*calibrations)
     center_mm = -R.T @ t
     apart = np.full((len(first), len(second)), _MOST_RAYS_APART)
     others = [*second.values()]
-    begins, ends = (np.array([one.times_ns[n] for one in others]) for n in (0, -1))
-    for row, one in enumerate(first.values()):
-        chosen = np.unique(np.linspace(0, len(one.times_ns) - 1, _FRAMES).round().astype(int))
-        times = one.times_ns[chosen] + round(offset_s * 1e9)
-        ends_px = one.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
+    begins, ends = (np.array([other.times_ns[n] for other in others]) for n in (0, -1))
+    for row, track in enumerate(first.values()):
+        chosen = np.unique(np.linspace(0, len(track.times_ns) - 1, _FRAMES).round().astype(int))
+        times = track.times_ns[chosen] + round(offset_s * 1e9)
+        ends_px = track.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
         rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)
         for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
             seen = {
@@ -200,7 +200,7 @@ def _apart(
                 continue
             other_rays = calibrations[1].camera.back_project(np.concatenate([*both.values()])) @ R
             own_rays = rays[[*both]].reshape(-1, 3)
-            distances = rays_apart(own_rays, other_rays, center_mm) / one.length_mm
+            distances = rays_apart(own_rays, other_rays, center_mm) / track.length_mm
             apart[row, column] = min(float(np.median(distances)), _MOST_RAYS_APART)
     return apart
 
@@ -210,15 +210,15 @@ class SecondRun:
     """The run of the other camera of two."""
 
     camera: SecondCamera
-    recording: Recording  # that has its messages
-    topics: Topics  # that they have there
+    recording: Recording  # with its messages
+    topics: Topics  # of its messages there
     node: "LocalizeByTwo | None"  # None if fish are not placed again
 
 
 def open_second(
     first: Recording, second: Path | None, setup: Setup, observer: RunObserver, *, places_fish: bool
 ) -> SecondRun | None:
-    """The run that is combined with the first, or that was; None for a single camera."""
+    """The run to combine with the first, or combined with it before; None for a single camera."""
     camera = first.header.second
     if second is not None:
         recording, topics = open_recordings([second]), TOPICS
@@ -248,8 +248,8 @@ def _localize_by_two(
 ) -> "LocalizeByTwo":
     """The node that places the fish of two runs. Raises UserError if they saw no fish together.
 
-    `second`: the fish of the other run, `other` its calibration. Those of the first are placed by
-    its fits, since of two cameras it has recorded what both know.
+    `second`: the fish of the other run, `other` its calibration. Fish of the first run are placed
+    by its fits, since a recording that was combined before has them as two cameras placed them.
     """
     calibration = setup.calibration
     if calibration is None or other is None:
@@ -269,7 +269,7 @@ def _localize_by_two(
         for mesh in messages_of(first, FittedMesh)
     )
     tracks, others = tracks_of(alone, calibration), tracks_of(second, other)
-    steps_ns = np.concatenate([[], *(np.diff(one.times_ns) for one in tracks.values())])
+    steps_ns = np.concatenate([[], *(np.diff(track.times_ns) for track in tracks.values())])
     pairing = None
     if len(steps_ns) and others:
         frame_s = float(np.median(steps_ns)) / 1e9
@@ -294,9 +294,9 @@ def _localize_by_two(
 
 
 class LocalizeByTwo:
-    """A node in the place of Localize: places fish by two cameras where both saw them.
+    """A node in the place of Localize: places fish by two cameras if both saw them.
 
-    Of a fish that both saw, only frames that both saw count.
+    Of such a fish only the frames that both cameras saw count.
     """
 
     def __init__(
@@ -329,10 +329,10 @@ class LocalizeByTwo:
             iou=alone.iou or 0.0,
         )
         placed = place_between((first, second), alone.midline_mm)
-        if placed.misfit > _MOST_MISFIT:  # one of the cameras may take the head for the tail
+        if placed.misfit > _MOST_MISFIT:  # a camera may take the head for the tail
             turned = second._replace(midline_px=second.midline_px[::-1])
             other = place_between((first, turned), alone.midline_mm)
-            placed = min(placed, other, key=lambda one: one.misfit)
+            placed = min(placed, other, key=lambda placement: placement.misfit)
         line = placed.midline_mm
         part = np.linalg.norm(alone.midline_mm - alone.keypoints_mm[1], axis=1).argmin()
         chord_mm = float(np.linalg.norm(line[0] - line[-1]))

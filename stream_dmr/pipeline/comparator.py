@@ -1,4 +1,4 @@
-"""Compare recomputed messages with recorded ones."""
+"""Compare recomputed messages with recorded messages."""
 
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -16,7 +16,7 @@ _MAX_SHOWN = 60  # characters of a value, so that both fit in a line
 
 
 class Difference(NamedTuple):
-    """One field of one message."""
+    """A field in which two messages differ."""
 
     field: str  # its path, such as "shape.losses.iou"
     recorded: str
@@ -50,7 +50,7 @@ def _is_same(a: object, b: object) -> bool:
 
 
 def _shown(value: object, other: object) -> str:
-    """A value as one line; of arrays of one shape the first entry that differs."""
+    """A value as one line; for arrays of equal shape the first entry that differs."""
     if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
         if value.shape != other.shape or value.dtype != other.dtype:
             return f"{value.dtype} array of shape {value.shape}"
@@ -65,7 +65,7 @@ def _shown(value: object, other: object) -> str:
 
 
 class Mismatch(NamedTuple):
-    """One field in which a recomputed message differs from the recorded one."""
+    """A field in which a recomputed message differs from the recorded message."""
 
     frame_index: int
     track_id: int
@@ -74,10 +74,10 @@ class Mismatch(NamedTuple):
 
 
 class MessageComparator:
-    """Compares recomputed messages with recorded ones, type by type, frame by frame.
+    """Compares recomputed messages with recorded messages, type by type, frame by frame.
 
-    The final length of a fish is compared with the recorded one wherever that stands: where a
-    recording was cut off, or goes on in another file, a track may end at another moment.
+    Final lengths are compared by fish, whatever their frames: if a recording was cut off, or
+    continues in another file, a track may end at another moment.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class MessageComparator:
         self.num_left_out = 0
         self.num_beyond = 0  # computed, and not recorded since the recording was cut off
         self.mismatches: list[Mismatch] = []
-        # Largest relative difference of a final length; infinite where one of two is missing.
+        # Largest relative difference of a final length; infinite if one of two is missing.
         self.length_change = 0.0
 
     def compare(self, computed: Message) -> None:
@@ -120,7 +120,7 @@ class MessageComparator:
             self._compare(recorded, computed)
 
     def finish(self) -> None:
-        """Compare the final lengths, and add what was recorded and not computed."""
+        """Compare the final lengths, and add messages that were recorded and not computed."""
         for expected in self._expected.values():
             for recorded in expected.rest():
                 self._add_missing(recorded)
@@ -134,7 +134,7 @@ class MessageComparator:
                 self.length_change = max(self.length_change, change)
         for recorded in self._recorded_final.values():
             self._add_missing(recorded)
-        self.mismatches.sort(key=lambda one: one.frame_index)
+        self.mismatches.sort(key=lambda mismatch: mismatch.frame_index)
 
     def _running(self, recorded: RecordedMessages, kind: type[Message]) -> Iterator[Message]:
         """The recorded messages of a type; final lengths are kept apart."""
@@ -168,7 +168,7 @@ class MessageComparator:
 
 
 def _length_change(recorded: LengthEstimate, computed: LengthEstimate) -> float:
-    """Relative difference of two final lengths; infinite where their fish fared differently."""
+    """Relative difference of two final lengths; infinite if status differs or one is missing."""
     before, now = recorded.length_mm, computed.length_mm
     if recorded.status != computed.status or (before is None) != (now is None):
         return inf

@@ -99,7 +99,7 @@ class WatchSettings(Settings):
 
 
 class AlertSettings(Settings):
-    """`[alerts]`: who is told when a run becomes unhealthy, and when it is healthy again."""
+    """`[alerts]`: where to report that a run is unhealthy, or healthy again."""
 
     webhook: str = Field(
         default="", description='address that gets a POST of JSON; "": nobody is told this way'
@@ -113,7 +113,7 @@ class AlertSettings(Settings):
 
 
 class DigestSettings(Settings):
-    """`[digest]`: what goes ashore of each day of an endless run."""
+    """`[digest]`: a small file of each day of an endless run, to be sent ashore."""
 
     folder: str = Field(
         default="",
@@ -186,7 +186,7 @@ class Config(Settings):
 def load_config(path: Path | str | None) -> Config:
     """The settings of a config.toml; None gives the defaults.
 
-    Raises ConfigError, one line on the first problem, where the file can't be read, is no TOML, or
+    Raises ConfigError, one line on the first problem, if the file can't be read, is no TOML, or
     holds an unknown table or key, a wrong type or a value out of range.
     """
     if path is None:
@@ -269,7 +269,7 @@ def toml_value(value: object) -> str:
 
 
 def _explain(problem: ErrorDetails) -> str:
-    """One line: where a value is wrong, what was expected, what was received."""
+    """A line with the place of a wrong value, the expected and the received value."""
     table, *keys = (str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
         return f" [{table}]: {_unknown_key(table, keys[0])}" if keys else _unknown_table(problem)
@@ -318,7 +318,6 @@ def _expected(field: FieldInfo, problem: ErrorDetails) -> str:
 
 
 def _toml_name(value: object) -> str:
-    """A received value in TOML's terms."""
     match value:
         case bool():
             return str(value).lower()
@@ -334,9 +333,9 @@ def _toml_name(value: object) -> str:
             return f"{value}"
 
 
-# Fish that lie on the reference plane, by table: gravity holds them flat to a degree or two, so
-# that they bend within the plane and hardly out of it; they are off it by what the plane was
-# measured to. What the template can't follow are their fins, not bends that nobody sees.
+# Settings for fish that lie on the reference plane, by table. Gravity holds them flat to a degree
+# or two, so they bend within the plane and hardly out of it; they are as far off it as the plane
+# was measured wrongly. Misfit comes from their fins, not from bends that nobody sees.
 _LYING: dict[str, dict[str, Any]] = {
     "fit_mesh": {
         "hang": "plane",
@@ -354,8 +353,8 @@ _LYING: dict[str, dict[str, Any]] = {
     },
     "smooth_length": {"upward_share": 0.5},
 }
-# Independent pictures: none follows another, and one good one gives a length. Ten
-# seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
+# Settings for independent pictures: none follows another, and one good picture suffices. Ten
+# seconds between them are more than anything in `[smooth_length]` remembers, except the track.
 _STILLS: dict[str, dict[str, Any]] = {
     # Nobody waits for the next frame.
     "crop_fish": {"segmenter_sizes_px": [128, 192, 256], "second_look": True},
@@ -365,8 +364,8 @@ _STILLS: dict[str, dict[str, Any]] = {
 }
 
 
-# Of fish placed by two cameras no slant is left, by which all frames err alike. Chosen on simulated
-# pairs (docs/two-cameras.md), where intervals are still too wide rather than too narrow.
+# Settings for fish placed by two cameras, without the slant by which all frames err alike. Chosen
+# on simulated pairs (docs/two-cameras.md): intervals are still too wide rather than too narrow.
 _BY_TWO: dict[str, dict[str, Any]] = {
     "smooth_length": {
         "frame_correlation": 0.15,
@@ -382,7 +381,7 @@ def by_two_cameras(config: Config) -> Config:
 
 
 def as_calibrated(config: Config) -> Config:
-    """The settings with a calibration, which is of pictures as the sensor sees them."""
+    """The settings with a calibration, which holds for pictures as the sensor sees them."""
     return _with(config, {"read_frames": {"orientation": "sensor"}})
 
 
@@ -398,7 +397,7 @@ def stills(config: Config, *, is_calibrated: bool) -> Config:
 
 
 def started_at(config: Config, start_utc: str) -> Config:
-    """The settings for a video that began then. Raises UserError where it is no time."""
+    """The settings for a video that began at `start_utc`. Raises UserError if that is no time."""
     try:
         utc_ns_of(start_utc)
     except ValueError as error:
@@ -408,7 +407,7 @@ def started_at(config: Config, start_utc: str) -> Config:
 
 
 def _with(config: Config, changes: dict[str, dict[str, Any]]) -> Config:
-    """With these values wherever the user has left the default."""
+    """The config with these values in all settings that the user left at their default."""
     default = Config()
     tables: dict[str, Settings] = {}
     for name, values in changes.items():

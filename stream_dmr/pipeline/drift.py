@@ -1,7 +1,7 @@
 """Alarms for a moved camera, a fouled lens, and fits that become worse.
 
-The static scene is what doesn't move before the camera (rail, hull), as edges. It is compared with
-the scene of when the calibration was first used in the output folder.
+The static scene is the edges of all that doesn't move before the camera (rail, hull). It is
+compared with the scene at the first use of the calibration in the output folder.
 """
 
 from collections import deque
@@ -56,14 +56,14 @@ _LONGER_SIDE_PX = 480  # of the compared pictures
 _NUM_SAMPLES = 9  # pictures per median; a fish or a wave covers a pixel in fewer than half of them
 _MAX_STATIC_SPREAD = 6  # grey levels; a pixel whose samples scatter more is moving
 _NIGHT_LEVEL = 8.0  # grey levels; at a lower mean, edges are not scaled up further
-_MIN_LIKENESS = 0.3  # correlation of the aligned edges of one scene; 1 for equal ones
+_MIN_LIKENESS = 0.3  # correlation of the aligned edges of the same scene; 1 for equal edges
 _BLUR_PX = 1.5  # of the edges before correlation: a shift of half a pixel must not matter
 _NUM_AGREEING = 3  # consecutive comparisons that must agree to raise or to end an alarm
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StaticScene:
-    """Edges of what doesn't move, independent of brightness."""
+    """Edges of all that doesn't move, independent of brightness."""
 
     edges: Float32[np.ndarray, "h w"]  # gradient over mean brightness; 0 where something moves
     scale: float  # frame px per px of `edges`
@@ -71,18 +71,18 @@ class StaticScene:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneChange:
-    """The difference between a scene and an earlier one."""
+    """The difference between a scene and an earlier scene."""
 
     shift_px: float  # of the static scene, frame px
-    likeness: float  # correlation of the edges after that shift: 1 for the same scene, 0 another
+    likeness: float  # correlation of the edges after that shift; 1: the same scene, 0: another
     sharpness: float  # edge strength now over edge strength then
 
 
 def static_scene(pictures: Sequence[UInt8[np.ndarray, "h w"]], *, scale: float) -> StaticScene:
-    """The edges of what stands still in most grey pictures of one camera.
+    """The edges of all that stands still in most grey pictures of one camera.
 
     They are the gradient (Sobel, grey levels per px) of the per-pixel median, scaled to a mean
-    brightness of 128, and 0 where the median absolute deviation says that something moves.
+    brightness of 128, and 0 where the median absolute deviation shows that something moves.
     """
     median = _upper_median(np.stack(pictures))
     spread = _upper_median(np.stack([cv2.absdiff(picture, median) for picture in pictures]))
@@ -112,9 +112,9 @@ def compare_scenes(before: StaticScene, now: StaticScene) -> SceneChange:
     )
 
 
-def _likeness(one: Float32[np.ndarray, "h w"], other: Float32[np.ndarray, "h w"]) -> float:
+def _likeness(before: Float32[np.ndarray, "h w"], now: Float32[np.ndarray, "h w"]) -> float:
     """Pearson correlation of two blurred edge pictures."""
-    a, b = (cv2.GaussianBlur(edges, (0, 0), _BLUR_PX) for edges in (one, other))
+    a, b = (cv2.GaussianBlur(edges, (0, 0), _BLUR_PX) for edges in (before, now))
     a, b = a - a.mean(), b - b.mean()
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / size if size > 0 else 0.0
@@ -126,12 +126,12 @@ def _shifted(edges: Float32[np.ndarray, "h w"], x: float, y: float) -> Float32[n
 
 
 def _edge_strength(edges: Float32[np.ndarray, "h w"]) -> float:
-    """The 99th percentile of the edges: that of outlines, not of noise."""
+    """The 99th percentile of the edges: the strength of outlines, not of noise."""
     return float(np.quantile(edges, 0.99))
 
 
 class SceneMonitor:
-    """Compares the static scene with a reference: the first one, or that of an earlier run."""
+    """Compares the static scene with a reference: the first scene, or that of an earlier run."""
 
     def __init__(self, settings: DriftSettings, *, reference: StaticScene | None = None) -> None:
         self.reference = reference
@@ -194,12 +194,12 @@ def decode_scene(data: bytes) -> StaticScene | None:
 
 
 class DriftAlarms:
-    """Monitors scene and fits of a run; notes alarms in the store and gives flags for lengths."""
+    """Monitors scene and fits of a run; notes alarms in the store and returns flags for lengths."""
 
     def __init__(
         self, store: LengthStore, settings: DriftSettings, *, on_notice: Callable[[str], None]
     ) -> None:
-        """References are those of earlier runs in the store with the same calibration."""
+        """References come from earlier runs in the store with the same calibration."""
         self._store = store
         self._on_notice = on_notice
         stored = store.scene()

@@ -27,13 +27,16 @@ from stream_dmr.store.trip import (
 )
 
 _RULE = "rule"
-_FAST_NS = 60_000_000_000  # so long must the vessel be fast; chosen
-_WATCHED_NS = 300_000_000_000  # a row of `watched` at least so often
-_PAUSE_NS = 10_000_000_000  # between two frames: what was watched is cut there
+_FAST_NS = 60_000_000_000  # time that the vessel must be fast; chosen
+_WATCHED_NS = 300_000_000_000  # longest time in a row of `watched`
+_PAUSE_NS = 10_000_000_000  # between two frames; a longer pause ends a row of `watched`
 
 
 class HaulLog:
-    """Called in the threads of the chain and of the server. Thread-safe."""
+    """Keeps the hauls of a run, and begins and ends hauls by rule.
+
+    Thread-safe: called in the threads of the chain and of the server.
+    """
 
     def __init__(
         self,
@@ -52,14 +55,14 @@ class HaulLog:
         self._ruled: str | None = None  # the haul that the rule began and has not ended
         self._last_fish_ns = 0
         self._in_view: dict[int, int] = {}  # tracks that have not ended, and when they began
-        self._in_chain: deque[int] = deque()  # capture times of the frames there, in order
+        self._in_chain: deque[int] = deque()  # capture times of the frames in the chain, in order
         self._fast_since_ns: int | None = None
         self._now_ns = 0  # capture time of the latest frame
         self._watched: list[int] | None = None  # first and last capture time, frames, lost
         self._lost_before = 0
 
     def hauls(self) -> list[Haul]:
-        """All hauls of the folder so far; those that others wrote into it as well."""
+        """All hauls of the folder so far, also those that other programs wrote into it."""
         with self._lock, suppress(OutputError):
             self._known = hauls_of(read_rows(self._store.path, HAULS))
         return self._known
@@ -69,7 +72,7 @@ class HaulLog:
         return hauls[-1] if hauls and hauls[-1].ended_ns is None else None
 
     def tell(self, what: str, name: str = "", *, said_by: str) -> str:
-        """Begin or end a haul now; returns its name. Raises UserError where that has no sense."""
+        """Begin or end a haul now; returns its name. Raises UserError if that makes no sense."""
         with self._lock:
             current = self.current()
             if what == START:
@@ -86,16 +89,16 @@ class HaulLog:
             return name
 
     def take_frame(self, timestamp_ns: int) -> None:
-        """A frame passes; its fish are not known yet."""
+        """Take a frame that enters the chain, whose fish are not known yet."""
         with self._lock:
             self._watch(timestamp_ns, self._frames_lost())
             self._now_ns = timestamp_ns
             self._in_chain.append(timestamp_ns)
 
     def frame_done(self) -> None:
-        """A frame has left the last stage: all fish that began in it or before are known.
+        """Take note that a frame has left the last stage: all fish that began by then are known.
 
-        A rule looks at these frames alone. The camera is ahead of them, after a pause by hours.
+        A rule uses these frames alone. The camera is ahead of them, after a pause by hours.
         """
         with self._lock:
             pause_ns = self._in_chain.popleft() - self._last_fish_ns
@@ -103,7 +106,7 @@ class HaulLog:
                 self._end_ruled(self._last_fish_ns)
 
     def take_fish(self, estimate: LengthEstimate) -> None:
-        """One more frame of a fish, or the end of its track."""
+        """Take the next frame of a fish, or the end of its track."""
         with self._lock:
             self._last_fish_ns = max(self._last_fish_ns, estimate.last_timestamp_ns)
             self._in_view.setdefault(estimate.track_id, estimate.first_timestamp_ns)
@@ -111,7 +114,7 @@ class HaulLog:
                 return
             if self._pause_ns and self._ruled is None and self.current() is None:
                 self._ruled = next_name(self.hauls())
-                # With all that are in view: one of them may have been there before.
+                # From the first frame of any fish in view: it may have come before this fish.
                 self._add(START, self._ruled, min(self._in_view.values()), _RULE)
             del self._in_view[estimate.track_id]
 
@@ -161,7 +164,7 @@ class HaulLog:
         self._watched = None
 
 
-_MAX_SECONDS = 9e9  # what 64 bits of nanoseconds hold: the year 2255
+_MAX_SECONDS = 9e9  # seconds that 64 bits of nanoseconds hold: the year 2255
 
 
 def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: str) -> str:
@@ -188,7 +191,7 @@ def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: s
 
 
 def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
-    """A time of the user on the clock of the frames."""
+    """A time that the user gave, on the clock of the frames."""
     seconds = _seconds(at)
     if seconds is not None:
         return round(seconds * 1e9)
@@ -208,7 +211,7 @@ def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
 
 
 def _seconds(at: str | None) -> float | None:
-    """`at` as seconds; None where it is no number. Raises UserError where it is no time."""
+    """`at` as seconds; None if it is no number. Raises UserError if it is out of range."""
     try:
         seconds = float(at or "")
     except ValueError:

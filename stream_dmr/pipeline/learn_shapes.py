@@ -2,13 +2,12 @@
 
 With `--template auto` a first pass over a source that has an end learns the shapes of all its fish
 before any of them is measured. The shapes of a camera's fish are learnt while they are measured,
-for those that come after: a length once given stays as it is, with the interval that was honest
-then; `replay --template auto` ashore measures all fish anew by what all of them show.
+for later fish: a length once reported stays as it is, with the interval that was honest then;
+`replay --template auto` ashore measures all fish again by the shapes learnt from all of them.
 
-A mesh that was given is compared with the fish once they are measured. Their shape is learnt
-beginning at the mesh. If it stays near the mesh, some of the fish are measured by both: a mesh of
-the right breadth may still be broader or slimmer enough at head and tail to make them longer or
-shorter.
+A mesh that was given is compared with the fish after they are measured. Their shape is learnt
+beginning at the mesh. If it stays near the mesh, some of the fish are measured by both shapes: a
+mesh of the right breadth may still be so broad or slim at head and tail that lengths change.
 """
 
 import itertools
@@ -69,8 +68,8 @@ from stream_dmr.store.open_results import (
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import save_template
 
-_MAX_FISH = 12  # that are measured by both shapes: how their lengths differ is much alike
-# Of the largest shift of lengths that is allowed: beyond it the shape is learnt once more, with new
+_MAX_FISH = 12  # measured by both shapes; their lengths differ much alike
+# Share of the largest allowed shift of lengths; beyond it the shape is learnt once more, with new
 # poses, before it is judged.
 _SURELY_ALLOWED = 0.5
 
@@ -80,11 +79,11 @@ Lengths = dict[int, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshComparison:
-    """How fish compare with the mesh that was given for them."""
+    """The comparison of fish with the mesh that was given for them."""
 
     mesh: CandidateShapes
     stocks: CandidateShapes | None  # learnt beginning at the mesh; None: it fits none of the masks
-    shift: LengthShift | None  # None where the shapes differ already
+    shift: LengthShift | None  # None if the shapes differ already
 
     @property
     def is_like_mesh(self) -> bool:
@@ -113,7 +112,7 @@ def compare_with_mesh(
     def by_mesh() -> Lengths:
         return _lengths(frames, setup, None)
 
-    @cache  # stocks that suffice are asked for twice
+    @cache  # called twice for stocks that suffice
     def shift_of(stocks: CandidateShapes) -> LengthShift | None:
         if not are_like_mesh(stocks):
             return None
@@ -124,7 +123,7 @@ def compare_with_mesh(
         shift = shift_of(stocks)
         return shift is not None and shift.off <= _SURELY_ALLOWED
 
-    # Only what would be disbelieved is looked at longer.
+    # Only shapes that would be disbelieved are learnt for longer.
     stocks = setup.learn(crops, mesh, suffices=suffices, progress=progress)
     return MeshComparison(
         mesh=mesh, stocks=stocks, shift=None if stocks is None else shift_of(stocks)
@@ -137,12 +136,15 @@ def _lengths(
     """The fish's lengths by these frames; empty without a calibration."""
     session = Session(replace(setup, candidates=candidates), first="fit")
     return {
-        one.track_id: (float(np.log(one.length_mm)), one.length_std_mm / one.length_mm)
-        for one in session.messages(crops, setup.config.recording)
-        if isinstance(one, LengthEstimate)
-        and one.is_final
-        and one.length_mm is not None
-        and one.length_std_mm is not None
+        estimate.track_id: (
+            float(np.log(estimate.length_mm)),
+            estimate.length_std_mm / estimate.length_mm,
+        )
+        for estimate in session.messages(crops, setup.config.recording)
+        if isinstance(estimate, LengthEstimate)
+        and estimate.is_final
+        and estimate.length_mm is not None
+        and estimate.length_std_mm is not None
     }
 
 
@@ -171,8 +173,8 @@ def with_learnt_shapes(
 ) -> Inputs:
     """The inputs with the shapes of the source's own fish, and its crops and frames.
 
-    As they are where nothing is to be learnt: a mesh was given, the settings say so, or the source
-    has no end.
+    Unchanged if nothing is to be learnt: a mesh was given, the settings switch it off, or the
+    source has no end.
     """
     config, request, forms = inputs.config, inputs.request, inputs.candidates
     if forms is None or inputs.is_endless or not config.fit_mesh.are_shapes_learnt:
@@ -183,7 +185,7 @@ def with_learnt_shapes(
     observer.stage("finding the fish, for their shapes")
     inputs, crops = _first_pass(inputs, crop_fish, stop=stop, observer=observer)
     if stop.is_set() or next(iter(crops), None) is None:
-        return inputs  # without fish the end says why
+        return inputs  # without fish the end of the run reports why
     on_part("learning their shapes")
     return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
 
@@ -215,10 +217,10 @@ def _first_pass(
 
 
 def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:
-    """The setup with the shapes that all these fish together have, told to the observer.
+    """The setup with the shapes of all these fish together, which the observer reports.
 
-    Without candidates these are the template's own, unless the fish show another: then their shapes
-    are learnt as by `--template auto`.
+    Without candidates the template's own shape stays, unless the fish have another: then their
+    shapes are learnt as by `--template auto`.
     """
     seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
     forms = setup.candidates
@@ -256,7 +258,7 @@ def _learn_and_report(
     forms: CandidateShapes,
     observer: RunObserver,
 ) -> CandidateShapes:
-    """The stocks of all fish; forms if no fish is seen whole, or stocks can't be of fish."""
+    """The stocks of all fish; `forms` if no fish is seen whole, or no stock can be of fish."""
     stocks = setup.learn(
         crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
     )
@@ -281,7 +283,7 @@ def _believed(
 
 
 def save_learnt(setup: Setup, out: Path, *, source: str) -> list[Path]:
-    """Write the meshes of learnt stocks, if there are any, into a run's folder. OutputError."""
+    """Write the meshes of learnt stocks, if any, into a run's folder. Raises OutputError."""
     stocks = None if setup.candidates is None else setup.candidates.stocks()
     if stocks is None:
         return []
@@ -293,7 +295,7 @@ def save_stocks(
 ) -> list[Path]:
     """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError.
 
-    Those that the command `made_by` wrote there before are replaced or removed.
+    Meshes that the command `made_by` wrote there before are replaced or removed.
     """
     for number in itertools.count(len(stocks) + 1):
         mesh = path.with_stem(f"{path.stem}-{number}")
@@ -303,10 +305,10 @@ def save_stocks(
             for leftover in (mesh, mesh.with_suffix(".toml")):
                 leftover.unlink(missing_ok=True)
     paths = stock_paths(path, len(stocks))
-    for stock, one in zip(stocks, paths, strict=True):
+    for stock, mesh_path in zip(stocks, paths, strict=True):
         save_template(
             replace(reshaped(template, stock.coefficients), name=stock.name),
-            one,
+            mesh_path,
             comment=mesh_comment(
                 made_by, f"the mean shape of {stock.share:.0%} of the fish of {source}"
             ),
@@ -320,7 +322,7 @@ def stock_paths(path: Path, num_stocks: int) -> list[Path]:
 
 
 class SeenFish:
-    """Good crops of the last fish that are finished. Thread-safe."""
+    """Good crops of the last finished fish. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -340,7 +342,7 @@ class SeenFish:
 
     @property
     def num(self) -> int:
-        """How many were seen whole and are finished, those included that are not kept any more."""
+        """Number of finished fish that were seen whole, also of those that are no longer kept."""
         with self._lock:
             return self._num
 
@@ -361,9 +363,9 @@ _NICENESS = 10  # frames come first
 
 
 class ShapeLearner:
-    """Learns from the fish that a camera saw, in a thread of its own, for those that come after.
+    """Learns from the fish that a camera saw, in a thread of its own, for later fish.
 
-    Used where no first pass has looked at the fish: the source has no end.
+    Used if the source has no end, so that no first pass was possible.
     """
 
     def __init__(
@@ -376,27 +378,27 @@ class ShapeLearner:
         write: Callable[[LearntShapes], object],
         observer: RunObserver,
     ) -> None:
-        """`learnt` by earlier runs: FitMesh knows it at once. `write` records what this run learns.
+        """`learnt` by earlier runs: FitMesh uses it at once. `write` records what this run learns.
 
-        `seen` has what is left of the fish of those runs, so that it is learnt on as if they were
-        one. `inputs` have candidates.
+        `seen` has the kept fish of those runs, so that learning continues as in a single run.
+        `inputs` have candidates.
         """
         assert inputs.candidates is not None
         self._inputs, self._seen, self._write, self._observer = inputs, seen, write, observer
         self._given = self._known = inputs.candidates
         [self._fit_mesh] = [node for node in session.nodes if isinstance(node, FitMesh)]
-        for one in learnt:
-            self._known = self._known.extended(one)
+        for shapes in learnt:
+            self._known = self._known.extended(shapes)
         self._fit_mesh.learn(self._known)
         self._compared: MeshComparison | None = None  # the last comparison with a given mesh
         self._stop = threading.Event()
         self._next_at = 2 * _num_fish(learnt[-1]) if learnt else _FIRST
         self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
         self._work: Future[CandidateShapes | None] | None = None
-        self._num_fish = 0  # that this work learns from
+        self._num_fish = 0  # from which the current work learns
 
     def take(self, frame: Frame) -> None:
-        """Learn if there are fish enough, and pass on what was learnt by this frame."""
+        """Begin to learn if there are enough fish; pass on shapes learnt by this frame."""
         if self._work is None:
             num_fish = self._seen.num
             if num_fish >= self._next_at:
@@ -433,7 +435,7 @@ class ShapeLearner:
             raise InterruptedError("the run has ended")
 
     def pass_on(self, learnt: LearntShapes) -> None:
-        """Measure the fish of this frame and of later frames by what was learnt."""
+        """Measure the fish of this frame and of later frames by the learnt shapes."""
         more = self._known.extended(learnt)
         stocks = more.stocks()
         assert stocks is not None
@@ -459,7 +461,7 @@ class ShapeLearner:
 
 
 def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:
-    """The next fish is none of these stocks as likely as each of the others was (Laplace)."""
+    """The shapes as a message; 1 / (num_fish + 1) is left for a fish of no stock (Laplace)."""
     return LearntShapes(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,
@@ -471,7 +473,7 @@ def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShap
 
 
 def _num_fish(learnt: LearntShapes) -> int:
-    """From how many fish the stocks of a `_message` were learnt."""
+    """Number of fish from which the stocks of a `_message` were learnt."""
     share = learnt.shares.sum()
     return round(share / (1 - share))
 

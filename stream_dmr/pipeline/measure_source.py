@@ -38,7 +38,10 @@ from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP
 
 
 class PositionFeed:
-    """Called in the thread of the source, and at the end of the run."""
+    """Writes the positions of a run.
+
+    Called in the thread of the source, and at the end of the run.
+    """
 
     def __init__(self, source: PositionSource, write: Callable[[Position], object]) -> None:
         self._source, self._write = source, write
@@ -50,7 +53,7 @@ class PositionFeed:
             self._write(position)
 
     def finish(self) -> str:
-        """Write those after the last frame; returns what a user must know of them all, or ""."""
+        """Write positions after the last frame; returns a line for the user on them all, or ""."""
         for position in self._source.finish():
             self._write(position)
         lines = [self._source.counts.left_out()]
@@ -60,15 +63,15 @@ class PositionFeed:
                 "none is of the time of the frames; check [sensors] start_utc and offset_s, or the "
                 "receiver",
             )
-        said = "; ".join(line for line in lines if line)
-        return said and f"positions of {self._source.name}: {said}"
+        remarks = "; ".join(line for line in lines if line)
+        return remarks and f"positions of {self._source.name}: {remarks}"
 
 
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
 
 
 class MessageFlow:
-    """Everyone who takes a run's messages beside the next stage, in the order in which they do."""
+    """Passes a run's messages to everything that takes them beside the next stage, in order."""
 
     def __init__(
         self,
@@ -78,7 +81,7 @@ class MessageFlow:
         observer: RunObserver,
         stop: threading.Event,
     ) -> None:
-        """The source is made to go on after earlier runs, positions begin to come."""
+        """Let the source continue after earlier runs, and let positions begin to come."""
         self.totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
         self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
         self._seen, self._observer = outputs.seen, observer
@@ -137,7 +140,7 @@ class MessageFlow:
 def _result_writer(
     inputs: Inputs, outputs: Outputs, stop: threading.Event, *, on_notice: Callable[[str], None]
 ) -> ResultWriter:
-    """The writer of a run; its source is made to continue after earlier runs."""
+    """The writer of a run, whose source continues after earlier runs from now on."""
     store = outputs.store
     clips = resume_source(inputs.source, store, on_notice=on_notice)
     if inputs.numbers_frames_on:
@@ -164,12 +167,12 @@ class RunSummary:
     """The results of a run."""
 
     fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
-    flags: Mapping[int, Sequence[str]]  # what a reader of a length must know, by track id
+    flags: Mapping[int, Sequence[str]]  # for the readers of a length, by track id
     num_frames: int  # that went through the whole chain
-    frames_promised: int | None  # by the source; None where it doesn't
+    frames_promised: int | None  # by the source; None if it promises none
     recorded_s: float  # capture time from the first frame to the last
     elapsed_s: float  # of the chain
-    parts_s: Mapping[str, float]  # of the whole run, the chain's among them: what took how long
+    parts_s: Mapping[str, float]  # by part of the whole run, the chain included
     calibration: Calibration | None
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # names of segments as a pattern
@@ -198,11 +201,11 @@ def measure_source(
     """Measure the fish of a source, with every stage recorded in `request.out`.
 
     All inputs are checked before the first frame; setting `stop` ends the run soon, with valid
-    results of the frames so far. Raises a UserError where an input is wrong, also in the middle of
-    the source; what was computed before is kept, and a note of the exception says where.
+    results of the frames so far. Raises a UserError if an input is wrong, also in the middle of
+    the source; results computed before are kept, and a note of the exception names their folder.
 
-    Where the fish turn out not to be like the mesh that was given, they are measured once more as
-    with `--template auto`, and those results replace the first ones.
+    If the fish turn out not to be like the mesh that was given, they are measured once more as
+    with `--template auto`, and the new results replace the first results.
     """
     observer = observer or RunObserver()
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
@@ -248,7 +251,7 @@ def _measure(
         clock.begin("comparing with the mesh")
         mesh_fits = True
         if not stop.is_set():
-            unused = inputs.finder.unused  # only now is it known what the source has no frames for
+            unused = inputs.finder.unused  # complete only at the end of the source
             if inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt:
                 mesh_fits = mesh_fits_fish(outputs.seen.crops(), inputs, observer)
         return replace(summary, parts_s=clock.parts_s()), mesh_fits
@@ -317,12 +320,12 @@ def _run_chain(
 
 @contextmanager
 def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -> Generator[None]:
-    """Note in lengths.db what ended the block."""
+    """Record in lengths.db how the block ended."""
     try:
         yield
     except UserError as error:
         store.end(f"an error: {error}", promised=_frames_received(inputs))
-        if not isinstance(error, OutputError):  # which says so itself
+        if not isinstance(error, OutputError):  # which reports that itself
             error.add_note(f"what was computed before is kept in {inputs.request.out}")
         raise
     except BaseException as error:

@@ -3,8 +3,8 @@
 Numba compiles a kernel when it is first called. All of them take a minute on a new installation, in
 which a camera's frames would be lost.
 
-Two processes share the work. Each takes from the cache what the other has put there: this one
-compiles the largest kernel of a descent first, the other what comes before and after it.
+Two processes share the work. Each takes from the cache what the other has put there: the first
+compiles the largest kernel of a descent, the second all kernels before and after it.
 """
 
 import fcntl
@@ -44,7 +44,7 @@ _SIZE_PX = 128
 
 
 def compile_kernels(fitter: Fitter) -> None:
-    """Fit a drawn fish once from cold and once from warm, which calls every kernel."""
+    """Fit a drawn fish once with a cold and once with a warm start, which calls every kernel."""
     crop = drawn_fish()
     fitter.fit(crop, fitter.fit(crop, None).best)
 
@@ -73,14 +73,14 @@ def drawn_fish() -> FishCrop:
 
 
 _TEMPLATE = "halibut"
-_PAUSE_S = 0.3  # between two looks at what the processes have done
-_ABOUT = 85  # kernels in the cache when all are; for the reader of the progress alone
+_PAUSE_S = 0.3  # between two looks at the progress
+_ABOUT = 85  # kernels in a full cache; only to show the progress
 
 
 def prepare_kernels(on_progress: Callable[[str], None], *, stop: Event) -> None:
     """Compile what the cache lacks; `on_progress` gets a line about it now and then.
 
-    Where that fails or `stop` is set, functions are compiled when they are first called.
+    If that fails or `stop` is set, functions are compiled when they are first called.
     """
     folder = cache_folder()
     if not is_compiling() or _is_complete(folder):
@@ -122,12 +122,12 @@ def _is_complete(folder: Path) -> bool:
 
 
 def kernels_of_machine() -> str:
-    """Name what compiled functions depend on beside their sources."""
+    """Compiler and processor, on which compiled functions depend beside their sources."""
     return f"numba {numba.__version__}, {llvmlite.binding.get_host_cpu_name()}"
 
 
 def _takes(lock: IO[str]) -> bool:
-    """False while another process compiles."""
+    """Take the lock; False while another process compiles."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -144,7 +144,7 @@ def _progress(folder: Path, began: float) -> str:
 
 
 def _compile_largest() -> None:
-    """Compile the normal equations by the types of their arguments, which do not exist yet."""
+    """Compile the normal equations by the types of empty arguments, before a fit has real ones."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
     body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
     points, flat, lengths = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)
@@ -166,11 +166,11 @@ def _compile_largest() -> None:
     rendering = Rendering(points, flat, np.zeros((0, 2), np.int64), picture, points, points)
     arguments = (problem, rest_vector(len(body.joints)), rendering)
     kernel: Any = normal_equations
-    kernel.compile(tuple(numba.typeof(one) for one in arguments))
+    kernel.compile(tuple(numba.typeof(argument) for argument in arguments))
 
 
 def _compile_rest() -> None:
-    """Compile all others; last those that need the largest, which is done by then."""
+    """Compile all other kernels; last those that need the largest, which is done by then."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
     levels = MeshLevels.from_template(template, max_faces=settings.max_faces)
     fitter = Fitter(template, settings)

@@ -27,8 +27,8 @@ from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs, SecondCamera
 from stream_dmr.recording.reading import Recording, known_shapes, messages_of
 
-_READ = "read"  # comes before all stages of a replay, whose frames are those of the recording
-# The settings that a replay from a later stage on leaves as they were, by their stage.
+_READ = "read"  # before all stages of a replay, which takes the recorded frames
+# Tables of settings by their stage; a replay from a later stage on keeps them as recorded.
 _TABLES = {
     "read_frames": _READ,
     "detect_fish": "crop",
@@ -37,7 +37,7 @@ _TABLES = {
     "fit_mesh": "fit",
     "localize": "localize",
 }
-# Of recordings older than a setting, what runs did then.
+# Values by which runs worked before a setting existed: table, key, value.
 _BEFORE = (("fit_mesh", "hang", "plane"), ("smooth_length", "upward_share", 0.5))
 _KEYS = {"species": {"model": "crop", "forms": "fit"}}  # of tables that several stages use
 
@@ -51,9 +51,8 @@ def replay_config(
 ) -> Config:
     """The settings of a replay from the stage `first` on.
 
-    Of a given config.toml the recorded settings of the stages before `first` are left out;
-    `on_notice` is told of those that it has otherwise. Raises ConfigError where one of the two
-    can't be read.
+    Settings of the stages before `first` stay as recorded; `on_notice` gets a line on those that a
+    given config.toml has otherwise. Raises ConfigError if one of the two can't be read.
     """
     recorded = parse_config(recorded_toml, where="the recording's config.toml")
     for table, key, before in _BEFORE:
@@ -69,12 +68,12 @@ def replay_config(
     unused: list[str] = []
     for table, stages in _stages_before(first, config).items():
         settings, earlier = getattr(config, table), getattr(recorded, table)
-        said = getattr(mine, table).model_fields_set if table in mine.model_fields_set else ()
+        written = getattr(mine, table).model_fields_set if table in mine.model_fields_set else ()
         kept = {key: getattr(earlier, key) for key in stages}
         unused += [
             f"[{table}] {key} = {toml_value(value)}"
             for key, value in kept.items()
-            if key in said and getattr(settings, key) != value
+            if key in written and getattr(settings, key) != value
         ]
         changes[table] = settings.model_copy(update=kept)
     if unused:
@@ -86,7 +85,7 @@ def replay_config(
 
 
 def _in_conditions_of(recorded: Config, given: Config) -> Config:
-    """The given settings with those of --pose lying and --stills, where the run had these."""
+    """The given settings, with those of --pose lying and --stills if the run had these."""
     config = given
     if recorded.localize.rests_on_plane and "rests_on_plane" not in given.localize.model_fields_set:
         config = lying(config)
@@ -97,7 +96,7 @@ def _in_conditions_of(recorded: Config, given: Config) -> Config:
 
 
 def _stages_before(first: str, config: Config) -> Mapping[str, Mapping[str, str]]:
-    """Table -> key -> stage, of the settings that belong to a stage before `first`."""
+    """The settings that belong to a stage before `first`: table -> key -> stage."""
     keys = {
         table: dict.fromkeys(type(getattr(config, table)).model_fields, stage)
         for table, stage in _TABLES.items()
@@ -122,10 +121,10 @@ class CropFiles:
 def find_crop_files(
     header: RunHeader, *, source: str | None, boxes: Path | None, masks: Path | None
 ) -> CropFiles:
-    """The given files; for a source, or for boxes and masks, that aren't given the run's own.
+    """The given files; without a source the run's own, without boxes and masks the run's own.
 
-    Raises UserError, which asks for boxes or masks, where the run's are gone or changed, or where
-    the recording is so old that it has no hash of them.
+    Raises UserError, which asks for boxes or masks, if the run's are gone or changed, or if the
+    recording is so old that it has no hash of them.
     """
     missing_source = ""
     if source is None:
@@ -137,7 +136,7 @@ def find_crop_files(
 
 
 def inputs_with(recorded: RunInputs | None, **given: str | Path | None) -> RunInputs | None:
-    """The recorded inputs, replaced by the given ones."""
+    """The recorded inputs, with the given files in their places."""
     if recorded is None:
         return None
     files = {name: InputFile.read(path) for name, path in given.items() if path is not None}
@@ -147,9 +146,9 @@ def inputs_with(recorded: RunInputs | None, **given: str | Path | None) -> RunIn
 
 
 def _find_source(header: RunHeader) -> tuple[str | None, str]:
-    """The place of the run's source, or None and what to say of it.
+    """The path of the run's source and "", or None and a complaint.
 
-    One without a hash is found by its place: each of its pictures has a checksum in the recording.
+    A source without a hash is found by its path: the recording has a checksum of each picture.
     """
     if header.inputs is None:
         return None, "give --source"
@@ -180,7 +179,7 @@ def _complaint(file: InputFile, option: str) -> str:
 class ReplayInputs(Setup):
     """The setup of a replay, and the files of its crops."""
 
-    files: CropFiles | None  # None where no crop is cut again
+    files: CropFiles | None  # None if no crop is cut again
 
 
 def read_inputs(
@@ -188,8 +187,8 @@ def read_inputs(
 ) -> ReplayInputs:
     """Read the given inputs and take the others from the recording. Raises a UserError.
 
-    `observer` is told what of the settings is not used, what was repaired of a template, and what
-    was learnt of the fish.
+    `observer` gets lines on settings that are not used, repairs of a template, and shapes learnt
+    from the fish.
     """
     header = recording.header
     config = replay_config(
@@ -255,7 +254,7 @@ def new_header(
 
 
 def _require_size_of_frames(calibration: Calibration, recording: Recording) -> None:
-    """Raise CalibrationError where a recording's first frame has another size; see `run`."""
+    """Raise CalibrationError if a recording's first frame has another size; see `run`."""
     first = next(recording.payloads([Frame]), None)
     if first is not None:
         picture = stored_picture(first[1])

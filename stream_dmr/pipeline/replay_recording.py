@@ -71,13 +71,13 @@ class OriginalRun:
 
 
 def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> OriginalRun:
-    """The run that made the recordings. Raises OutputError where lengths.db is damaged."""
+    """The run that made the recordings. Raises OutputError if lengths.db is damaged."""
     folders = [path if path.is_dir() else path.parent for path in recordings]
     databases = [database for folder in folders if (database := database_of(folder)) is not None]
     expected = run_facts(header)
     facts, flags = None, dict[int, Sequence[str]]()
     for database in dict.fromkeys(databases):
-        flags |= {one.estimate.track_id: one.flags for one in read_measured_fish(database)}
+        flags |= {fish.estimate.track_id: fish.flags for fish in read_measured_fish(database)}
         made = [run for run in read_runs(database).values() if _is_same(run, expected)]
         facts = made[-1] if made else facts
     return OriginalRun(facts=facts, flags=flags)
@@ -101,7 +101,7 @@ def open_replay_outputs(
 ) -> Generator[ResultWriter]:
     """Open everything that a replay writes to; it is closed in the reverse order.
 
-    Raises OutputError where the folder can't be written to, or holds an earlier run's results.
+    Raises OutputError if the folder can't be written to, or holds an earlier run's results.
     """
     header = new_header(request, recording.header, inputs, second)
     try:
@@ -115,8 +115,10 @@ def open_replay_outputs(
     prepare_folder(out, overwrite=request.overwrite)
     facts, known = run_facts(header), recorded.facts
     if known is not None:
-        told = {name: getattr(known, name) for name in ("vessel", "trip", "haul", "utc_zero_ns")}
-        facts = replace(facts, **told)
+        taken_over = {
+            name: getattr(known, name) for name in ("vessel", "trip", "haul", "utc_zero_ns")
+        }
+        facts = replace(facts, **taken_over)
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
         store = stack.enter_context(closing(LengthStore(out, facts, signer=signer)))
@@ -163,7 +165,7 @@ def _end_of(request: ReplayOptions, recorded: RunFacts | None) -> str:
 
 
 class ReplayWriter:
-    """Passes every message of the chain on as a recording gives it back."""
+    """Records and compares the messages of the chain; returns each as a recording would hold it."""
 
     def __init__(
         self,
@@ -175,7 +177,7 @@ class ReplayWriter:
         whole: WholeRecords,
         comparator: MessageComparator,
     ) -> None:
-        """`results`, None without --out, gets `whole` records of what is not recomputed."""
+        """`results`, None without --out, gets `whole` records of messages not recomputed."""
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
         self._results, self._whole, self._comparator = results, whole, comparator
         self._positions = recorded.of_type(Position, keep_payloads=False)
@@ -184,7 +186,7 @@ class ReplayWriter:
         self.num_frames = 0
 
     def write(self, message: Message) -> Message:
-        """Record, compare and count a message; returns it as the next node is to get it."""
+        """Record, compare and count a message; returns it as the next node gets it."""
         if type(message) in self._recomputed or isinstance(message, TrackEnded):
             if self._results is not None:
                 message = self._results.write(message)
@@ -205,7 +207,7 @@ class ReplayWriter:
         return message
 
     def finish(self) -> None:
-        """Record what comes after the last frame: positions, and what a second camera saw."""
+        """Record the rest after the last frame: positions, and messages of a second camera."""
         if self._results is not None:
             self._results.put(self._whole.rest())
             self._write_positions(self._results, None)
@@ -223,14 +225,14 @@ class ReplayWriter:
             self._results.frame_done()
 
 
-# Relative, of lengths, where the last bits are rounded differently: a fit stops at a tolerance of
-# its own, so it may stop an iteration sooner or later. Measured differences were about 0.1 %.
+# Allowed relative difference of lengths if the last bits are rounded differently: a fit stops at a
+# tolerance of its own, so it may stop an iteration sooner or later. Measured: about 0.1 %.
 LENGTH_TOLERANCE = 5e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySummary:
-    """How a replay went."""
+    """The results of a replay."""
 
     fish: Sequence[LengthEstimate]  # final, by track id
     num_frames: int
@@ -238,16 +240,16 @@ class ReplaySummary:
     recorded_s: float  # capture time from the first frame to the last
     counters: Sequence[StageCounters]
     num_compared: int
-    num_left_out: int  # of fish that were in view before the recording began, see docs/replay.md
-    num_beyond: int  # recomputed where the recording was cut off before them
+    num_left_out: int  # messages of fish in view before the recording began, see docs/replay.md
+    num_beyond: int  # messages recomputed after the point where the recording was cut off
     mismatches: Sequence[Mismatch]
-    # Of the recording's versions and arithmetic those that are others here; empty: bits must agree.
+    # Versions and arithmetic that differ here from the recording's; empty: bits must agree.
     other_versions: Sequence[str] = ()
     length_change: float = 0.0  # largest relative difference of a final length
 
     @property
     def is_as_recorded(self) -> bool:
-        """True where all bits agree, or lengths do within the tolerance for other versions."""
+        """True if all bits agree, or lengths do within the tolerance for other versions."""
         is_near = bool(self.other_versions) and self.length_change <= LENGTH_TOLERANCE
         return not self.mismatches or is_near
 
@@ -255,10 +257,10 @@ class ReplaySummary:
 def replay(
     request: ReplayOptions, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> ReplaySummary:
-    """Recompute a recording from one stage on; with `check`, compare with what was recorded.
+    """Recompute a recording from one stage on; with `check`, compare with the recording.
 
-    Raises a UserError where an input is wrong or the recording is damaged. A torn recording is
-    replayed as far as it is whole, and `observer` is warned of what is lost.
+    Raises a UserError if an input is wrong or the recording is damaged. A torn recording is
+    replayed as far as it is whole, and `observer` gets a warning of the loss.
     """
     observer = observer or RunObserver()
     recording = open_recordings(request.recordings)
@@ -332,7 +334,7 @@ def replay(
 
 
 def _other_versions(recording: Recording) -> list[str]:
-    """What of the versions by which bits are the same is another one here."""
+    """Names of the versions that must agree for equal bits, and that differ here."""
     known, here = recording.metadata, recording.header.metadata()
     others = [name for name in REPRODUCIBLE_BY if known.get(name) != here[name]]
     ran_by = known.get("onnx_providers"), here["onnx_providers"]  # "": no network was opened
@@ -340,14 +342,17 @@ def _other_versions(recording: Recording) -> list[str]:
 
 
 def _is_light(request: ReplayOptions) -> bool:
-    """True where no stage computes outside of Python for long."""
+    """True if no stage computes outside of Python for long."""
     return FittedMesh not in messages_from(request.first)
 
 
 def _open_whole(
     recording: Recording, settings: RecordingSettings, second: SecondRun | None, stack: ExitStack
 ) -> WholeRecords:
-    """Pictures are those of the sources of two cameras, since their view is made here first."""
+    """Open the records of messages that are not recomputed.
+
+    For two cameras with pictures of both sources, since their view is made here first.
+    """
     meshes = MeshRebuilder.of(recording) if settings.rrd or settings.foxglove else None
     if second is None:
         return WholeRecords(meshes)
@@ -408,7 +413,7 @@ def _refuse_unused(request: ReplayOptions) -> None:
 
 
 def _carried_over(request: ReplayOptions, recorded: RecordedMessages) -> list[LocalizedFish]:
-    """The frames from before the recording that count towards a length; notes say which don't."""
+    """The frames from before the recording that count towards a length; notes name the rest."""
     carried_over = recorded.carried_over()
     if not carried_over or request.first == "smooth":
         return carried_over
@@ -464,6 +469,6 @@ def _open_chain(
         )
 
     ends = recorded.of_type(TrackEnded, keep_payloads=False)
-    pauses = {one.frame_index for one in ends if one.cause == "pause"}
+    pauses = {end.frame_index for end in ends if end.cause == "pause"}
     crop_fish = CropFishOfRuns(open_crop_fish, recording.header.runs, pauses=pauses)
     return frames, Session(inputs, given=[crop_fish])

@@ -37,7 +37,7 @@ from stream_dmr.tracking.finder import FishFinder, open_finder
 
 
 def require_known_species(settings: SpeciesSettings) -> None:
-    """Raise ConfigError unless the own list of `[species]` is one, and its forms are bundled."""
+    """Raise ConfigError unless the own list of `[species]` is valid, and its forms are bundled."""
     load_species(settings.own_list)
     forms = bundled_names()
     for code, form in forms_of_species(settings).items():
@@ -49,16 +49,16 @@ def require_known_species(settings: SpeciesSettings) -> None:
 
 
 def species_notes(config: Config, template: Template) -> list[str]:
-    """A line where `[fisheries] species` is nothing known, so that fish get no weight by it.
+    """A line if `[fisheries] species` is not known, so that fish get no weight by it.
 
-    Known are body forms, the run's template, and species by a code, or a name of the bundled list.
+    Known are body forms, the run's template, and species by code or by a name of the bundled list.
     """
     wanted, bundled = config.fisheries.species, load_species()
     known = [template.name, *bundled_names()]
-    known += [one.code for one in load_species(config.species.own_list)]
+    known += [species.code for species in load_species(config.species.own_list)]
     if wanted.casefold() in map(str.casefold, known) or find_species(wanted, bundled):
         return []
-    names = [name for one in bundled for name in (one.english_name, one.scientific_name)]
+    names = [name for fish in bundled for name in (fish.english_name, fish.scientific_name)]
     return [
         f"[fisheries] species: '{wanted}' is no template, body form or known species, so fish get "
         f"no weight and no legal size{_nearest(wanted, [*known, *names])}"
@@ -66,7 +66,7 @@ def species_notes(config: Config, template: Template) -> list[str]:
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
-    by_small = {one.casefold(): one for one in known}
+    by_small = {known_name.casefold(): known_name for known_name in known}
     near = difflib.get_close_matches(name.casefold(), by_small, n=1)
     return f"; did you mean '{by_small[near[0]]}'?" if near else ""
 
@@ -76,12 +76,12 @@ class Inputs(Setup):
     """A request with its files read and checked, and the open source."""
 
     request: RunOptions
-    notices: Sequence[str]  # what was repaired or found when the template was read
+    notices: Sequence[str]  # lines on repairs and findings when the template was read
     finder: FishFinder
     reader: ReadFrames
     positions: PositionSource | None = None  # None: none were asked for
-    crops: KeptCrops | None = None  # of the whole source, where its fish were found before
-    kept_frames: KeptFrames | None = None  # that the reader gives, where it read them before
+    crops: KeptCrops | None = None  # of the whole source, if a first pass found its fish
+    kept_frames: KeptFrames | None = None  # that the reader returns again, after a first pass
 
     @property
     def source(self) -> Source:
@@ -93,18 +93,18 @@ class Inputs(Setup):
 
     @property
     def utc_zero_ns(self) -> int | None:
-        """What added to a capture time gives UTC, ns since 1970; None: not known."""
+        """UTC, ns since 1970, at capture time 0; None if not known."""
         sensors = self.config.sensors
         return sensors.offset_ns if _is_since_1970(self.source) else sensors.zero_utc_ns
 
     @property
     def resumes(self) -> bool:
-        """True where the run continues after the results that are in its folder."""
+        """True if the run continues after the results that are in its folder."""
         return self.is_endless and not self.request.overwrite
 
     @property
     def numbers_frames_on(self) -> bool:
-        """True where frames have numbers after those of earlier runs; annotations count anew."""
+        """True if frame numbers continue those of earlier runs; in annotations they begin anew."""
         is_annotated = self.request.boxes is not None or self.request.masks is not None
         return self.is_endless and not is_annotated
 
@@ -122,7 +122,7 @@ class Inputs(Setup):
         )
 
     def _given(self) -> RunInputs:
-        """The files of the request with their hashes; frames without an end have none."""
+        """The files of the request with their hashes; a source without an end has none."""
         request = self.request
         if not Path(request.source).exists():
             source = InputFile(path=self.source.name)
@@ -148,7 +148,7 @@ class Inputs(Setup):
 def checked_inputs(request: RunOptions) -> Inputs:
     """Read and check the files of a request; the caller closes the reader.
 
-    Raises a UserError where one of them is wrong.
+    Raises a UserError if any of them is wrong.
     """
     config = _config(request)
     notices: list[str] = []
@@ -190,12 +190,12 @@ def checked_inputs(request: RunOptions) -> Inputs:
         positions=positions,
     )
     if inputs.is_endless and candidates is None and config.fit_mesh.are_shapes_learnt:
-        return replace(inputs, candidates=given_mesh(template))  # others may join it later
+        return replace(inputs, candidates=given_mesh(template))  # learnt shapes may join it later
     return inputs
 
 
 def _config(request: RunOptions) -> Config:
-    """The settings, with what the request's options change of them."""
+    """The settings, changed by the request's options."""
     config = load_config(request.config)
     if request.calibration is not None:
         config = as_calibrated(config)
@@ -209,7 +209,7 @@ def _config(request: RunOptions) -> Config:
 
 
 def _keep_template(request: RunOptions) -> None:
-    """Raise a UserError where the given mesh is of the results that are replaced."""
+    """Raise a UserError if the given mesh is among the results that are replaced."""
     mesh = Path(request.template).resolve()
     if mesh in {path.resolve() for path in learnt_files(request.out)}:
         raise UserError(
@@ -219,7 +219,7 @@ def _keep_template(request: RunOptions) -> None:
 
 
 def _is_since_1970(source: Source) -> bool:
-    """True where capture times are times of day, not from the start of a video."""
+    """True if capture times are times of day, not from the start of a video."""
     return source.is_live or source.is_endless
 
 
@@ -228,7 +228,7 @@ _LARGEST_LEAN_RAD = np.radians(20)  # chosen: cameras are aimed at the fish, wit
 
 
 def start_notices(inputs: Inputs) -> Iterator[str]:
-    """A line each: of the template, the species, the calibration, and what is not recorded."""
+    """Lines on the template, the species, the calibration, and pictures that are not kept."""
     yield from inputs.notices
     yield from species_notes(inputs.config, inputs.template)
     if line := provider_notice(SHIPPED):

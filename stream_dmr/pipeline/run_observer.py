@@ -12,42 +12,42 @@ from stream_dmr.store.length_store import LengthStore
 
 
 class RunObserver:
-    """Is called as a run goes on, from the run's threads. This base class ignores all of it."""
+    """Takes the events of a run, called from the run's threads. This base class ignores them."""
 
     address: str | None = None  # where it shows the run, once `open` has been called
-    # False: `take` makes nothing of the images of frames, so a second pass may leave them out or
-    # give them smaller.
+    # False: `take` does not use the images of frames, so a second pass may leave them out or shrink
+    # them.
     needs_pictures = True
 
     def warn(self, line: str) -> None:
-        """The user should know this; the same line may come again."""
+        """Report a line that the user should know; the same line may come again."""
 
     def stage(self, line: str) -> None:
         """Report the work before the first frame is measured, and its progress."""
 
     def notice(self, line: str) -> None:
-        """Something worth knowing that is no reason to worry."""
+        """Report something of interest that is no reason to worry."""
 
     def serving(self, address: str) -> None:
-        """The view can be watched at `address` from now on."""
+        """Report that the view can be watched at `address` from now on."""
 
     def open(self, inputs: Inputs, store: LengthStore, hauls: HaulLog, sinks: SinkStates) -> None:
-        """Inputs and outputs are open; raise a UserError to refuse the run."""
+        """Take the open inputs and outputs; raise a UserError to refuse the run."""
 
     def attach(self, chain: Chain) -> None:
-        """The chain with its counters is about to take its first frame."""
+        """Take the chain with its counters, before its first frame."""
 
     def close(self) -> None:
-        """The run is over, however it ended. Idempotent."""
+        """Close after the run, however it ended. Idempotent."""
 
     def begin(self, num_frames: int | None) -> None:
-        """Measuring starts; `num_frames` is as the source promises, None where it doesn't."""
+        """Take the start of measuring; `num_frames` as the source promises, None if it doesn't."""
 
     def take(self, message: Message) -> None:
-        """A stage has given a message; this is how the next stage gets it."""
+        """Take a message of a stage, as the next stage gets it."""
 
     def frame_done(self) -> None:
-        """A frame has left the last stage."""
+        """Take note that a frame has left the last stage."""
 
 
 class RunTotals(RunObserver):

@@ -102,10 +102,10 @@ def command_of(request: RunOptions) -> RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions:
-    """What to replay; None: as it was recorded. A field with a text is an option of `replay`."""
+    """The options of a replay; None: as recorded. A field with a text is an option of `replay`."""
 
     recordings: Sequence[Path] = ()  # files or folders, in order
-    first: Stage = "fit"  # the first that is recomputed
+    first: Stage = "fit"  # the first stage that is recomputed
     second: Path | None = None  # another camera's run of the same fish, for `localize`
     check: Annotated[bool, "Compare with what was recorded; exit 1 if it differs."] = False
     config: Annotated[Path | None, "Settings instead of the recorded ones."] = None

@@ -54,7 +54,7 @@ _SENSORS = SensorsSettings()
 class ResultWriter:
     """Writes every message of the chain, called in the thread of its stage.
 
-    A finished fish goes to the store first, so that no failure of what follows can lose it.
+    A finished fish goes to the store first, so that no later failure can lose it.
     """
 
     def __init__(
@@ -72,15 +72,15 @@ class ResultWriter:
         hauls: HaulLog | None = None,
         on_notice: Callable[[str], None],
     ) -> None:
-        """`clips`: frames done of each clip before; None where the source has no clips.
+        """`clips`: frames done of each clip before; None if the source has no clips.
 
         `interrupted`: frames of fish that a crash interrupted, and that this run finishes. `flags`:
-        what is known already, by track, of the fish of a recording. `flag_at_end`: gives that of
-        the fish that are in view at the end of the frames; "": none.
+        by track, the known flags of the fish of a recording. `flag_at_end`: returns the flag of
+        fish that are in view at the end of the frames; "": none.
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
         self._flags, self._flag_at_end = flags, flag_at_end
-        self._gone: dict[int, int] = {}  # by track that ended before the frames: after which one
+        self._gone: dict[int, int] = {}  # frame of its end, by track that ended before the source
         self._hauls = hauls
         self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
         self._drift, self._on_notice = drift, on_notice
@@ -94,7 +94,7 @@ class ResultWriter:
     def write(self, message: Message, *, payload: bytes | None = None) -> Message:
         """Write a message; returns it as the next stage must get it, see `Recorder.write`.
 
-        `payload`: its encoding, where it was made before.
+        `payload`: its encoding, if it was made before.
         """
         self.store(message)
         if payload is None:
@@ -112,7 +112,7 @@ class ResultWriter:
             self._recorder.put(record)
 
     def store(self, message: Message) -> None:
-        """Keep what lengths.db holds of a message, before anything else is done with it."""
+        """Store the part of a message that lengths.db holds, before any other use of it."""
         match message:
             case Frame():
                 self._take_frame(message)
@@ -149,7 +149,7 @@ class ResultWriter:
             self._store.clip_progress(clip, frames_done=self._clips[clip])
 
     def finish(self) -> None:
-        """The last message was written: keep the last position, from which others are interpolated.
+        """Keep the last position, from which others are interpolated, after the last message.
 
         Idempotent.
         """
@@ -191,7 +191,7 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
-        # A stop drops the ends of tracks that come after the frame that the last stage is at.
+        # A stop drops the ends of tracks after the frame that the last stage is at.
         gone = self._gone.pop(estimate.track_id, None)
         is_in_view = gone is None or (bool(self._in_chain) and gone > self._in_chain[0][0])
         if is_in_view and (flag := self._flag_at_end()) and flag not in flags:
@@ -207,10 +207,10 @@ class ResultWriter:
 def resume_source(
     source: Source, store: LengthStore, *, on_notice: Callable[[str], None]
 ) -> dict[str, int] | None:
-    """Let a source begin after what earlier runs measured.
+    """Let a source begin after the frames that earlier runs measured.
 
-    Returns the frames done of each unfinished clip, None where the source has no clips. What is
-    wrong with a clip is an event of the run as well.
+    Returns the frames done of each unfinished clip, None if the source has no clips. Problems with
+    a clip are events of the run as well.
     """
     if (behind_s := store.clock_behind_s()) >= 1:
         line = (
@@ -255,7 +255,7 @@ def learnt_before(out: Path, header: RunHeader) -> list[LearntShapes]:
 def seen_before(out: Path) -> SeenFish:
     """The last fish that earlier runs in a folder recorded and finished, to learn from.
 
-    Nothing of segments that can't be read, and of those whose masks were removed.
+    Segments that can't be read, or whose masks were removed, are left out.
     """
     finished, segments = set[int](), list[Recording]()
     for segment in _segments(out, "mcap"):
@@ -264,7 +264,7 @@ def seen_before(out: Path) -> SeenFish:
         with suppress(RecordingError):
             recording = open_recordings([segment])
             lengths = messages_of(recording, LengthEstimate)
-            finished |= {one.track_id for one in lengths if one.is_final}
+            finished |= {estimate.track_id for estimate in lengths if estimate.is_final}
             segments.append(recording)
     seen, selection = SeenFish(), Selection(tracks=frozenset(finished))
     for recording, kind in product(reversed(segments), (FishCrop, LengthEstimate)):
@@ -296,7 +296,7 @@ def interrupted_tracks(
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """The open outputs of a run, and what it found in the folder."""
+    """The open outputs of a run, and the earlier results found in the folder."""
 
     store: LengthStore
     hauls: HaulLog
@@ -304,16 +304,16 @@ class Outputs:
     recorder: Recorder
     repairs: Sequence[Repair]  # of recordings that a crash left unfinished
     interrupted: Sequence[LocalizedFish]  # frames of fish that were in view at that crash
-    learnt: Sequence[LearntShapes]  # by earlier runs of a camera, of its fish
-    seen: SeenFish  # by those, to which this run adds its own
+    learnt: Sequence[LearntShapes]  # shapes of fish, by earlier runs of a camera
+    seen: SeenFish  # fish of those runs, to which this run adds its own
 
 
 @contextmanager
 def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     """Open everything that a run writes to; it is closed in the reverse order.
 
-    Raises OutputError where the folder can't be written to, or holds an earlier run's results. An
-    endless run warns of what the disk refuses, and tries again.
+    Raises OutputError if the folder can't be written to, or holds an earlier run's results. If the
+    disk refuses a write, an endless run warns and tries again.
     """
     request, settings = inputs.request, inputs.config.recording
     out, is_endless = request.out, inputs.is_endless
@@ -334,7 +334,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     )
     with ExitStack() as stack:
         # At the end lengths.csv is complete before it is signed, it is signed while the store is
-        # open, and the provenance is made of all that there is then.
+        # open, and the provenance is made last, of all files.
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
         store = LengthStore(out, facts, waits_for_disk=is_endless, signer=Signer(request.key))
         stack.enter_context(closing(store))
@@ -347,7 +347,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         stack.enter_context(closing(observer))
         hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
         observer.open(inputs, store, hauls, states)
-        # What earlier runs recorded is read before a new segment stands beside it.
+        # Recordings of earlier runs are read before a new segment stands beside them.
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
         )
@@ -363,7 +363,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
                 on_closed=files.changed,
                 states=states,
             )
-        # For a replay, which finds the fish again.
+        # For a replay that finds the fish again, and numbers them as this run does.
         begin = RunStart(
             frames_before=store.before.frame_index if inputs.numbers_frames_on else 0,
             tracks_before=store.before.track_id,
@@ -396,7 +396,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
 
 
 def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
-    """Make room for the run, before anything of it is written; what keeps it free, not started."""
+    """Make room before anything of the run is written; the Retention that keeps it, not started."""
     out, keep_free_gb = inputs.request.out, inputs.config.recording.keep_free_gb
     retention = Retention(
         out,
@@ -405,7 +405,7 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
         on_notice=observer.warn,
         on_changed=files.changed,
     )
-    with suppress(OSError, OutputError):  # it tries again while the run goes on
+    with suppress(OSError, OutputError):  # it tries again during the run
         retention.free_space()
     return retention
 

@@ -70,7 +70,7 @@ class Setup:
         suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
         progress: Callable[[str], None] = lambda step: None,
     ) -> CandidateShapes | None:
-        """The stocks that these fish are of, starting from `forms`: see `learn_shapes`."""
+        """The stocks of these fish, learnt from `forms` on: see `learn_shapes`."""
         return learn_shapes(
             crops,
             self.template,
@@ -144,7 +144,7 @@ def stage_number(stage: Stage) -> int:
 
 
 class Session:
-    """The nodes of a chain over one setup: given ones, then those of the stages to compute."""
+    """The nodes of a chain over one setup: given nodes, then those of the stages to compute."""
 
     def __init__(
         self,
@@ -164,9 +164,9 @@ class Session:
             self.nodes[-1].step(fish)
 
     def messages(self, inputs: Iterable[Message], settings: RecordingSettings) -> Iterator[Message]:
-        """Messages of all nodes, each as a recording with these settings gives it to the next node.
+        """Messages of all nodes, each as a recording with these settings hands it to the next node.
 
-        Computed in this thread; tracks end with `inputs` alone.
+        Computed in this thread; only the end of `inputs` ends tracks.
         """
         for message in inputs:
             yield from _through(self.nodes, [message], settings)
@@ -185,19 +185,19 @@ def _through(
 
 
 def _without_ends(messages: Iterable[Message], settings: RecordingSettings) -> list[Message]:
-    return [as_recorded(one, settings) for one in messages if not isinstance(one, TrackEnded)]
+    return [as_recorded(sent, settings) for sent in messages if not isinstance(sent, TrackEnded)]
 
 
 _IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the disk
 
 
 class KeptCrops:
-    """The crops of a first pass: in place of CropFish, a node that gives them again."""
+    """Keeps the crops of a first pass; a node in place of CropFish that returns them again."""
 
     def __init__(self, *, in_memory: int = _IN_MEMORY) -> None:
-        """Beyond so many bytes they go to the disk."""
+        """`in_memory`: bytes, beyond which crops go to the disk."""
         self._file: IO[bytes] = SpooledTemporaryFile(in_memory)  # noqa: SIM115, see `close`
-        self._places: dict[int, list[tuple[int, int]]] = {}  # of each frame: offsets and sizes
+        self._places: dict[int, list[tuple[int, int]]] = {}  # by frame: offsets and sizes
         self._ended: dict[int, list[TrackEnded]] = {}
 
     def keep(self, message: FishCrop | TrackEnded) -> None:
@@ -212,7 +212,7 @@ class KeptCrops:
         return (crop for frame_index in self._places for crop in self._of(frame_index))
 
     def step(self, frame: Frame, /) -> Sequence[FishCrop | TrackEnded]:
-        """The crops of a frame, and who is gone after it."""
+        """The crops of a frame, and the tracks that ended after it."""
         return [*self._of(frame.frame_index), *self._ended.get(frame.frame_index, [])]
 
     def close(self) -> Sequence[FishCrop]:
@@ -231,20 +231,20 @@ _LENGTH_BYTES = 4  # before each part of the file
 
 
 class KeptFrames:
-    """The frames of a first pass as a recording by reference has them, to be iterated once.
+    """Keeps the frames of a first pass as a recording by reference has them, to iterate once.
 
-    Those that the view shows have a picture of its size, the others none.
+    Frames that the view shows have a picture of its size, the others none.
     """
 
     def __init__(self, settings: RecordingSettings, folder: Path) -> None:
-        """They are on the disk of `folder`, without a name, so that a crash leaves nothing."""
+        """Keep them on the disk of `folder`, in a file without a name: a crash leaves nothing."""
         self._settings, self._folder = settings, folder
         self._throttle = FrameThrottle(settings.view_rate_hz)
         self._file: IO[bytes] = TemporaryFile(dir=folder)  # noqa: SIM115, see `__iter__`
-        self.payload = b""  # of the frame that was given last, as it was encoded with its pixels
+        self.payload = b""  # of the last frame returned, as it was encoded with its pixels
 
     def keep(self, frame: Frame) -> None:
-        """Take the next frame. Raises OutputError where the disk is full."""
+        """Take the next frame. Raises OutputError if the disk is full."""
         shown = b""
         if self._throttle.shows(frame):
             small = shrink_by_halves(frame.image, most_px=self._settings.view_px)
@@ -266,7 +266,7 @@ class KeptFrames:
 
 
 class CropFishOfRuns:
-    """A CropFish for each run: its tracks end with it, and the next one numbers its fish on."""
+    """A CropFish for each run: its tracks end with the run, the next run continues the numbers."""
 
     def __init__(
         self,
@@ -275,19 +275,19 @@ class CropFishOfRuns:
         *,
         pauses: Collection[int] = (),
     ) -> None:
-        """`runs` by their frames; none: one run, whose fish count from 1.
+        """`runs` in the order of frames; empty: a single run, whose fish count from 1.
 
         `pauses`: the frames after which all tracks ended, since the source paused.
         """
         self._pauses = pauses
         self._open, self._runs = open_crop_fish, deque(runs)
         self._crop_fish, self._is_new = open_crop_fish(), True
-        self._frames_before = -1  # of the run that goes on
+        self._frames_before = -1  # of the current run
 
     def step(self, frame: Frame, /) -> list[FishCrop | TrackEnded]:
-        """The fish of one frame, as the run had them that recorded it.
+        """The fish of a frame, as in the run that recorded it.
 
-        Of runs that began at one frame, as those with given boxes say, the first goes on.
+        If several runs report the same first frame, as with given boxes, the first continues.
         """
         ended = list[FishCrop | TrackEnded]()
         while self._runs and self._runs[0].frames_before < frame.frame_index:
@@ -315,7 +315,7 @@ class RecordedMessages:
     def __init__(self, recording: Recording, selection: Selection = EVERYTHING) -> None:
         self._recording = recording
         self._selection = selection
-        self.notes: list[str] = []  # what the user should know of this replay
+        self.notes: list[str] = []  # lines for the user on this replay
         self._payloads: dict[int, bytes] = {}  # by id() of messages on their way through the chain
 
     @property
@@ -323,9 +323,9 @@ class RecordedMessages:
         return self._recording.ends_early
 
     def carried_over(self) -> list[LocalizedFish]:
-        """The frames from before the recording of the tracks that were open when it began.
+        """Earlier frames of the tracks that were open when the recording began.
 
-        None of a selection in time, which begins without them.
+        Empty for a selection in time, which begins without them.
         """
         if self._selection.time_ns is not None:
             return []
@@ -333,9 +333,9 @@ class RecordedMessages:
         return [message for message in fish if self._selection.includes(message)]
 
     def of_type(self, kind: type[M], *, keep_payloads: bool = True) -> Iterator[M]:
-        """The messages of one type; `payload` gives the encoding of each that was kept.
+        """The messages of a type; with `keep_payloads`, `payload` returns the encoding of each.
 
-        Frames have no images where they were recorded by reference.
+        Frames have no images if they were recorded by reference.
         """
         for _, payload in self._recording.payloads([kind], self._selection):
             message = decode(kind, payload)
@@ -349,9 +349,9 @@ class RecordedMessages:
     ) -> Iterator[Frame]:
         """The frames with the images of `restorer`, or with those that the recording holds.
 
-        Raises RecordingError where it holds none (`missing_source` says why the source was not
-        found) and, with `exact`, where they are not the very pixels that the run continued with;
-        without `exact`, `notes` says so.
+        Raises RecordingError if it holds none (`missing_source`: why the source was not found) and,
+        with `exact`, if they are not the very pixels that the run continued with; without `exact`,
+        this is added to `notes`.
         """
         restorer = restorer or RecordedPictures(self._recording, self._selection)
         for frame in self.of_type(Frame):
@@ -375,24 +375,24 @@ class RecordedMessages:
             self.notes.append(note)
 
     def payload(self, message: Message) -> bytes:
-        """The encoding of a message that came from here; only once."""
+        """Remove and return the encoding of a message that came from here."""
         return self._payloads.pop(id(message))
 
 
-# How much further a message of a fish may stand than what it is sought for. Chosen.
+# Number of frames beyond the sought frame in which a message may stand. Chosen.
 _AHEAD_FRAMES = 300
 
 
 class SoughtMessages:
     """Messages of one type, sought by frame and fish in nearly the order in which they stand.
 
-    A fish comes with crops of earlier frames when it is known as one, maybe in a later segment.
+    A track confirmed as a fish comes with crops of earlier frames, maybe in a later segment.
     """
 
     def __init__(self, messages: Iterator[Message]) -> None:
         self._messages = messages
         self._next = next(messages, None)
-        self._passed: dict[tuple[int, int], Message] = {}  # and not taken yet
+        self._passed: dict[tuple[int, int], Message] = {}  # passed and not taken yet
 
     def until(self, frame_index: int) -> list[Message]:
         """The next messages up to a frame, in their order."""
@@ -425,7 +425,7 @@ class SoughtMessages:
 class PlaybackNode:
     """Takes the place of a node and returns the messages that the node returned in the run.
 
-    The first node of a chain returns the ends of tracks as well. A recording of before 0.2 has
+    The first node of a chain returns the ends of tracks as well. Recordings from before 0.2 have
     none: there a track ends when its fish is unseen for `track_timeout_s`.
     """
 
@@ -438,7 +438,7 @@ class PlaybackNode:
         self._last: Frame | None = None
 
     def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
-        """The recorded messages of a frame and its ends, or that of one fish in a frame."""
+        """The messages of a frame and the tracks that end there, or of a fish in a frame."""
         if not isinstance(message, Frame):
             found = self._messages.take(message.frame_index, message.track_id)
             return [] if found is None else [found]
@@ -458,4 +458,4 @@ class PlaybackNode:
         """The ends of the tracks that are left, if none was recorded."""
         if self._timeout is None or self._last is None:
             return ()
-        return [TrackEnded.after(self._last, one, "end") for one in self._timeout.open_ids]
+        return [TrackEnded.after(self._last, track, "end") for track in self._timeout.open_ids]
