@@ -65,18 +65,18 @@ def batch(
         from stream_dmr.store.ledger import Signer
 
         if key is not None:
-            Signer(key)  # refuses what is no key before any video
-        load_shapes(template)  # refuses what it can't read before any video
+            Signer(key)  # refuses a wrong key before any video
+        load_shapes(template)  # refuses an unreadable template before any video
         require_known_species(load_config(config).species)
         if (out / VIDEOS).exists():
-            read_videos(out)  # refuses a table that is no batch's
+            read_videos(out)  # refuses a table of no batch
         jobs = read_manifest(manifest, config=config, template=template, key=key)
         warn(repeated_videos(jobs))
-        with _engine(engine, workers, address, gpus) as where:
+        with _engine(engine, workers, address, gpus) as opened:
             summary = run_batch(
                 jobs,
                 out,
-                where,
+                opened,
                 stop=stop,
                 log=lambda line: print(line, file=sys.stderr, flush=True),
             )

@@ -1,4 +1,4 @@
-"""The command `stream-dmr`. What is heavy is imported inside the commands: --help must be quick."""
+"""The command `stream-dmr`. Commands import large modules inside: --help must be quick."""
 
 import io
 import os
@@ -29,7 +29,7 @@ from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.version import __version__
 
-# In the order and groups of --help, each with what it says there.
+# The commands in the order and groups of --help, each with its line there.
 _GROUPS: dict[str, dict[Callable[..., None], str]] = {
     "Measure": {
         demo: "Measure the fish of the embedded scene.",
@@ -75,7 +75,7 @@ def _name(command: Callable[..., None]) -> str:
 
 
 class _GroupedHelp(TyperGroup):
-    """Lists the commands by what they are for."""
+    """Lists the commands in groups by their purpose."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a list of commands for each group."""
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Lead closed ones to /dev/null: the next file that is opened would be one of them."""
+    """Lead closed streams to /dev/null, or the next file that is opened would become a stream."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -133,15 +133,15 @@ class _PlainStream(io.TextIOWrapper):
             "write_through": True,
         }
         super().__init__(io.BufferedWriter(self._file), **options)
-        # Rich, which asks for this name, has controls of its own; a `Console` is given this stream
-        # as its file, since on a terminal its bars put another one into `sys`.
+        # Rich, which asks for this name, has controls of its own; a `Console` gets this stream as
+        # its file, since on a terminal its bars put another stream into `sys`.
         self.rich_proxied_file = io.TextIOWrapper(self.buffer, **options)
 
     def write(self, text: str, /) -> int:
         return super().write(printable(text))
 
     def lost_for(self) -> str:
-        """Why something could not be written; "" if nothing was lost."""
+        """The reason why something could not be written; "" if nothing was lost."""
         self.flush()
         return self._file.reason
 
@@ -160,12 +160,12 @@ class _LossyFile(io.FileIO):
 class _WithoutPandas(MetaPathFinder, Loader):
     """Hides pandas, which only our development packages and users install.
 
-    PyArrow would import it, 40 MB and a fifth of a second of every run, to ask whether a list is
-    one of its series. No command needs it, and pyarrow does without.
+    PyArrow would import it, 40 MB and a fifth of a second of every run, only to find out whether a
+    list is a pandas series. No command needs it, and pyarrow does without.
     """
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
-        """A spec that cannot be imported: torch only looks whether there is one."""
+        """A spec of pandas that cannot be imported: torch only looks for the spec."""
         return ModuleSpec(fullname, self) if fullname == "pandas" else None
 
     def exec_module(self, module: ModuleType) -> None:
@@ -176,7 +176,7 @@ class _WithoutPandas(MetaPathFinder, Loader):
 def exit_codes() -> Generator[None]:
     """Turns a UserError into one line and exit code 2, other errors into a traceback and 1.
 
-    So it does with what Typer says of a wrong command line.
+    Typer's errors on a wrong command line become a line and exit code 2, too.
     """
     try:
         yield
@@ -203,14 +203,14 @@ def one_line(error: UserError) -> str:
 
 
 def _usage_line(error: typer.TyperException) -> str:
-    """What is wrong with a command line, and where to read how it must be."""
+    """A line with the mistake in a command line and the command for help."""
     context: Any = getattr(error, "ctx", None)
     command = app.info.name if context is None else context.command_path
-    said = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
-    cause: Any = error.__cause__  # Pydantic's, which does not always say what came
-    got = [repr(one["input"]) for one in cause.errors()] if hasattr(cause, "errors") else []
-    came = "".join(f", got {one}" for one in got if one not in said)
-    return f"error: {said[:1].lower()}{said[1:]}{came}; see {command} --help"
+    mistake = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
+    cause: Any = error.__cause__  # Pydantic's, whose message does not always contain the input
+    inputs = [repr(part["input"]) for part in cause.errors()] if hasattr(cause, "errors") else []
+    got = "".join(f", got {text}" for text in inputs if text not in mistake)
+    return f"error: {mistake[:1].lower()}{mistake[1:]}{got}; see {command} --help"
 
 
 def _print_version(is_asked: bool) -> bool:

@@ -79,7 +79,7 @@ def combine(
 
 
 def _replay_and_print(request: ReplayOptions, *, timings: bool) -> "ReplaySummary":
-    """Replay, with the fish and the speed printed; exits if a signal stopped it."""
+    """Replay and print the fish and the speed; exits if a signal stopped it."""
     from stream_dmr.cli.terminal import RunDisplay, print_replay
     from stream_dmr.pipeline.replay_recording import replay as replay_recording
 

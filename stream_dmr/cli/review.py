@@ -1,4 +1,4 @@
-"""`stream-dmr review`, `import` and `agreement`: what reviewers decide, and how well they agree."""
+"""`stream-dmr review`, `import` and `agreement`: decisions of reviewers, and their agreement."""
 
 from contextlib import closing
 from pathlib import Path
@@ -83,10 +83,10 @@ def import_(
     from stream_dmr.web.open_reports import open_report
 
     report = open_report(folder, source=source)
-    said, doubts = import_tracks(report, viame, reviewer=reviewer or getuser())
-    for line in said:
+    lines, doubts = import_tracks(report, viame, reviewer=reviewer or getuser())
+    for line in lines:
         print(line)
-    print(f"{folder}: {len(said) or 'nothing differs from the review, no'} verdicts written")
+    print(f"{folder}: {len(lines) or 'nothing differs from the review, no'} verdicts written")
     warn([*report.recording.warnings, *doubts])
 
 

@@ -39,7 +39,7 @@ def run(
 def _measure(
     options: RunOptions, *, log_json: bool = False, timings: bool = False, truth: Path | None = None
 ) -> bool:
-    """Measure and print what was found, also beside true lengths; False if any is missing there."""
+    """Measure and print the fish, also beside true lengths; False if any fish is missing there."""
     from stream_dmr.sources.decoder import decoding_ahead
 
     source = Path(options.source)
@@ -54,7 +54,7 @@ def _measure(
             summary = measure_source(request, stop=stop, observer=WatchObserver(observer))
         _print_measured(summary, timings=timings)
         is_complete = truth is None or print_beside_truth(request.out / "lengths.csv", truth)
-        # A camera's run goes on where one of them was lost, which it says.
+        # A camera's run continues after it has lost a file, and reports that.
         names = (path.name for path in summary.files if any(request.out.glob(path.name)))
         print(f"results in {request.out}: {', '.join(names)}")
     stop.exit()
@@ -109,7 +109,7 @@ def demo(
 
 
 def _is_of_demo(out: Path) -> bool:
-    """True for a folder whose results are those of earlier demos alone."""
+    """True if all results in a folder are from earlier demos."""
     from stream_dmr.errors import OutputError
     from stream_dmr.store.fish import database_of, read_runs
 
@@ -119,13 +119,14 @@ def _is_of_demo(out: Path) -> bool:
     except OutputError:
         return False
     commands = [f"{facts.command} " for facts in runs.values()]
-    return bool(commands) and all(one.startswith("stream-dmr demo ") for one in commands)
+    return bool(commands) and all(command.startswith("stream-dmr demo ") for command in commands)
 
 
 def print_beside_truth(lengths: Path, truth: Path) -> bool:
-    """Print measured lengths beside the true ones; True if every fish was measured.
+    """Print measured lengths beside true lengths; True if every fish was measured.
 
-    Fish are compared by track_id: here both count them in the order in which they come into view.
+    Fish are compared by track_id: here both files count them in the order in which they come into
+    view.
     """
     from stream_dmr.cli.terminal import print_true_lengths
     from stream_dmr.evaluation.compare import evaluate
@@ -146,16 +147,16 @@ def setup() -> None:
 
     began, console = time.monotonic(), Console(file=sys.stderr, highlight=False)
     with stop_on_signals() as stop, console.status("") as status:
-        said = list[str]()
+        lines = list[str]()
 
-        def say(line: str) -> None:
-            """Draw it on a terminal; elsewhere print the first line alone."""
-            if not console.is_terminal and not said:
+        def show(line: str) -> None:
+            """Draw the line on a terminal; elsewhere print the first line alone."""
+            if not console.is_terminal and not lines:
                 console.print(line, markup=False)
-            said.append(line)
+            lines.append(line)
             status.update(line)
 
-        prepare_kernels(say, stop=stop)
+        prepare_kernels(show, stop=stop)
     stop.exit()
     print(f"ready, after {time.monotonic() - began:.0f} s")
 

@@ -1,4 +1,4 @@
-"""What several commands share: options, the command as typed, signals that end a run."""
+"""Shared by several commands: options, the command as typed, signals that end a run."""
 
 import _thread
 import gc
@@ -84,7 +84,7 @@ def typer_command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _typer_option(parameter: Parameter) -> Any:
-    """Its annotation, with an option of Typer in the place of the texts."""
+    """The annotation of a parameter, with an option of Typer in the place of the texts."""
     kind, *texts = get_args(parameter.annotation) or (parameter.annotation,)
     if not texts or not isinstance(texts[0], str):
         return parameter.annotation
@@ -129,7 +129,7 @@ def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
 
 
 def settings_of(config: Path | None, recorded_toml: str, recording: Path) -> "Config":
-    """The settings that --config gives, else those that a recording holds."""
+    """The settings of --config, or those of a recording if there is no --config."""
     from stream_dmr.pipeline.config import load_config, parse_config
 
     if config is not None:
@@ -148,12 +148,12 @@ def _parse_time(text: str) -> tuple[float, float]:
 
 
 class Stop(threading.Event):
-    """Set by a signal, which it remembers."""
+    """An event that a signal sets, with the signal's number."""
 
     signal_number = 0
 
     def exit(self, hint: str = "") -> None:
-        """End the command with the signal's exit code, where one came; `hint`: what to do next."""
+        """End the command with the exit code of the signal, if any; `hint`: the next step."""
         if self.signal_number:
             print(f"stopped by {_name(self.signal_number)}{hint}", file=sys.stderr)
             raise typer.Exit(128 + self.signal_number)
@@ -161,9 +161,9 @@ class Stop(threading.Event):
 
 @contextmanager
 def importing() -> Generator[None]:
-    """For imports of large libraries: a fifth quicker without looking for garbage in them.
+    """Import large libraries in the block a fifth quicker, without looking for garbage in them.
 
-    Nor is it looked for there later, since what is imported stays.
+    Later they are not searched for garbage either, since imported modules stay.
     """
     gc.disable()
     try:
@@ -175,7 +175,7 @@ def importing() -> Generator[None]:
 
 @contextmanager
 def exit_on_signals() -> Generator[None]:
-    """Ctrl-C and SIGTERM end the block by SystemExit, so that it cleans up; repeated ones don't."""
+    """End the block by SystemExit at the first Ctrl-C or SIGTERM alone, so that it cleans up."""
     number_of_first = 0
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -194,14 +194,14 @@ def exit_on_signals() -> Generator[None]:
 
 @contextmanager
 def stop_on_signals() -> Generator[Stop]:
-    """Ctrl-C and SIGTERM set the event instead of interrupting; repeated ones change nothing."""
+    """Set the event at Ctrl-C or SIGTERM instead of interrupting; repeated signals do nothing."""
     stop = Stop()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         if not stop.signal_number:
             stop.signal_number = number
-            # In another thread: a second signal may interrupt this one, or the main thread may be
-            # waiting for the event, and the lock in it can't be taken twice.
+            # In another thread: a second signal may interrupt this handler, or the main thread may
+            # be waiting for the event, and the lock in it can't be taken twice.
             _thread.start_new_thread(stop.set, ())
 
     with _handling_signals(on_signal):
@@ -214,7 +214,7 @@ def _name(number: int) -> str:
 
 @contextmanager
 def _handling_signals(handler: Callable[[int, FrameType | None], None]) -> Generator[None]:
-    """Ctrl-C and SIGTERM call the handler within the block."""
+    """Call the handler at Ctrl-C and SIGTERM within the block."""
     signals = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, handler) for number in signals]
     try:

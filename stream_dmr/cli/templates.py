@@ -101,7 +101,7 @@ def learn_template(
             forms,
             progress=lambda step: progress.update(task, description=step),
         )
-    warn([line for one in opened for line in one.warnings])
+    warn([line for recording in opened for line in recording.warnings])
     if stocks is None:
         raise TemplateError(
             "learn-template: expected fish that are completely visible, found none; give more "
@@ -117,9 +117,9 @@ def learn_template(
 
 
 def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[FishCrop]":
-    """The crops of all as reviewed, with ids of their own, without rejected fish and doubles.
+    """The crops of all recordings as reviewed, with unique ids, without rejected fish and doubles.
 
-    Raises UserError where two have a frame of the same source: its fish would count twice.
+    Raises UserError if two have a frame of the same source: its fish would count twice.
     """
     from stream_dmr.errors import UserError
     from stream_dmr.messages import FishCrop
@@ -130,7 +130,7 @@ def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[Fi
     for number, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
         source, database = _identity(recording), database_of(path)
         fish = () if database is None else read_stored_fish(database)
-        left_out = {one.estimate.track_id for one in fish if not one.counts}
+        left_out = {stored.estimate.track_id for stored in fish if not stored.counts}
         for crop in ReviewedMessages(recording, database).of(FishCrop):
             first = first_with.setdefault((source, crop.timestamp_ns), number)
             if first != number:
@@ -143,7 +143,7 @@ def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[Fi
 
 
 def _identity(recording: "Recording") -> str:
-    """What was filmed: the content of the source; of a camera, or where unknown, its name."""
+    """The hash of a recording's source; its path or name for a camera, or if there is no hash."""
     inputs = recording.header.known_inputs
     if inputs is None:
         return recording.header.source

@@ -1,4 +1,4 @@
-"""What the terminal shows of a run: progress, warnings, and the table of fish at the end."""
+"""Show a run on the terminal: progress, warnings, and the table of fish at the end."""
 
 import sys
 import time
@@ -21,7 +21,7 @@ from stream_dmr.pipeline.replay_recording import LENGTH_TOLERANCE, ReplaySummary
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.store.schema import flags_in_status
 
-_LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
+_LINE_EVERY_S = 10.0  # without a terminal, which would show a bar
 _PLAIN_WIDTH = 120
 # Text is shown as it is: names of files, vessels and species may be [red] or :fish:, too.
 _console = partial(Console, highlight=False, markup=False, emoji=False)
@@ -87,7 +87,7 @@ class RunDisplay(RunObserver):
         self._num_done += 1
         now = time.monotonic()
         speed = f"{self._num_done / max(now - self._began, 1e-9):.1f} frames/s"
-        if self._is_measuring:  # a first pass knows of no fish
+        if self._is_measuring:  # a first pass has no fish yet
             speed += f", {len(self._fish)} fish"
         self._progress.update(self._task, advance=1, speed=speed)
         if self._progress.disable and now - self._last_line >= _LINE_EVERY_S:
@@ -103,9 +103,9 @@ class RunDisplay(RunObserver):
 def print_fish(
     fish: Sequence[LengthEstimate], flags: Mapping[int, Sequence[str]] = MappingProxyType({})
 ) -> None:
-    """Print the table of fish to stdout; `flags`: of the fish that have some, by track id."""
-    titles = {"species": "species_code", "fate": "fate"}  # of the run's fish, if it knows any
-    known = {t: name for t, name in titles.items() if any(getattr(one, name) for one in fish)}
+    """Print the table of fish to stdout; `flags` by track id, of the fish that have any."""
+    titles = {"species": "species_code", "fate": "fate"}  # if any fish has them
+    known = {t: name for t, name in titles.items() if any(getattr(f, name) for f in fish)}
     table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", *known, "status")
     for estimate in fish:
         table.add_row(
@@ -118,16 +118,16 @@ def print_fish(
         )
     _stdout().print(table if fish else "no fish")
     for title, name in known.items():
-        print(f"{title}: {counts_text(getattr(one, name) for one in fish)}")
+        print(f"{title}: {counts_text(getattr(estimate, name) for estimate in fish)}")
 
 
 def counts_text(names: Iterable[str | None]) -> str:
-    """How often each name comes, the most frequent first, such as: 3 landed, 1 unknown."""
+    """The count of each name, the most frequent first, such as: 3 landed, 1 unknown."""
     return ", ".join(f"{count} {name or '-'}" for name, count in Counter(names).most_common())
 
 
 def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> None:
-    """Print the fish of a replay, its speed and where its results are, to stdout."""
+    """Print the fish of a replay, its speed and the folder of its results, to stdout."""
     print_fish(summary.fish)
     if timings:
         print_timings(summary)
@@ -138,7 +138,7 @@ def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> 
 
 
 def print_check(summary: ReplaySummary) -> None:
-    """Print to stdout how the results of a replay differ from the recorded ones."""
+    """Print to stdout how the results of a replay differ from the recording."""
     found = summary.mismatches
     for item in found[:_MAX_SHOWN]:
         print(
@@ -172,7 +172,7 @@ def print_check(summary: ReplaySummary) -> None:
 
 
 def print_timings(summary: RunSummary | ReplaySummary) -> None:
-    """Print what each stage of the chain took, its part of the recording included, to stdout."""
+    """Print the time of each stage of the chain, its part of the recording included, to stdout."""
     table = _table("stage", "messages in", "out", "busy ms/frame", "CPU ms/frame", "busy %")
     for counter in summary.counters:
         table.add_row(
@@ -190,7 +190,7 @@ def print_timings(summary: RunSummary | ReplaySummary) -> None:
 
 
 def print_speed(summary: RunSummary) -> None:
-    """Print how many frames were measured in what time, all passes included, to stdout."""
+    """Print the number of frames, the time of all passes and the speed, to stdout."""
     start_s = summary.parts_s["starting"]
     elapsed_s = sum(summary.parts_s.values()) - start_s
     promised, num_frames = summary.frames_promised, summary.num_frames
@@ -207,12 +207,12 @@ def _times_real_time(recorded_s: float, elapsed_s: float) -> str:
 
 
 def print_evaluation(evaluation: Evaluation) -> None:
-    """Print measured lengths beside the true ones, then the summary, to stdout."""
+    """Print measured lengths beside true lengths, then the summary, to stdout."""
     _stdout().print(_beside_truth(evaluation), "", _figures(summary_rows(evaluation)), sep="\n")
 
 
 def print_true_lengths(evaluation: Evaluation) -> None:
-    """Print measured lengths beside the true ones, and how far off they are in words, to stdout."""
+    """Print measured lengths beside true lengths, and their mean error in words, to stdout."""
     measured = [fish for fish in evaluation.fish if fish.error_mm is not None]
     off = [abs(fish.error_mm or 0.0) / fish.truth_mm for fish in measured]
     _stdout().print(_beside_truth(evaluation))
@@ -246,7 +246,7 @@ def _figures(rows: list[tuple[str, str]]) -> Table:
 
 
 def _stdout() -> Console:
-    """A console as wide as the terminal, or without one, wide enough for any row."""
+    """A console as wide as the terminal, or without a terminal wide enough for any row."""
     width = None if sys.stdout.isatty() else _PLAIN_WIDTH
     return _console(width=width)
 
@@ -269,7 +269,7 @@ def interval_text(estimate: LengthEstimate) -> str:
 
 
 def status_text(estimate: LengthEstimate) -> str:
-    """The status; where there is no length, with the reasons why frames were refused."""
+    """The status; if there is no length, with the reasons why frames were refused."""
     reasons = sorted(estimate.refused.items(), key=lambda item: -item[1])
     shown = [f"{count} {reason}" for reason, count in reasons if reason != estimate.status]
     if estimate.length_mm is not None or not shown:

@@ -7,7 +7,7 @@ import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, warn
 
-_INTERRUPTED = 3  # an exit code of its own: scripts must tell a crash from a change
+_INTERRUPTED = 3  # an exit code of its own: scripts must distinguish a crash from a change
 _Source = Annotated[
     str | None,
     "The recorded clip, for pictures of the fish.",
@@ -66,7 +66,7 @@ def verify(
     for database in databases:
         try:
             lines = [*summary(database), *run_notes(database.parent)]
-        except Exception as error:  # a row that is no row of ours is a change, named above
+        except Exception as error:  # a row that can't be read is a change, reported above
             lines = [f"its runs can't be told: {type(error).__name__}"]
         for line in lines:
             print(f"{database}: {line}")

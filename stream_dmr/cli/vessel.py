@@ -48,7 +48,10 @@ def haul(
             "run, got another kind of address"
         )
     else:
-        print(_write(Path(target), what, name, at))
+        from stream_dmr.pipeline.haul_log import write_haul
+
+        written = write_haul(Path(target), what, name=name, at=at, said_by=getuser())
+        print(f"haul {written}: {what}")
 
 
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
@@ -66,25 +69,20 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
     except urllib.error.HTTPError as error:
         with error:
             is_ours = error.headers.get_content_type() == "text/plain"
-            said = error.read(500).decode(errors="replace").strip() if is_ours else ""
+            reply = error.read(500).decode(errors="replace").strip() if is_ours else ""
         if error.code == HTTPStatus.UNAUTHORIZED:
-            said = "it wants its access token: --token-file FILE"
-        raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
+            reply = "it wants its access token: --token-file FILE"
+        raise UserError(
+            f"{address}: expected it to take the haul, got: {reply or error}"
+        ) from error
     except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
-        # A URLError says <urlopen error ...> of what the system said, or of a text.
+        # The text of a URLError, <urlopen error ...>, hides its cause: an error or a text.
         cause = error.reason if isinstance(error, urllib.error.URLError) else error
         got = reason_of(cause) if isinstance(cause, Exception) else cause
         raise UserError(
             f"{address}: expected the status page of a run, got: {got}; give the address that "
             "the run prints when it starts ([watch] port in its config)"
         ) from error
-
-
-def _write(folder: Path, what: str, name: str, at: str | None) -> str:
-    from stream_dmr.pipeline.haul_log import write_haul
-
-    written = write_haul(folder, what, name=name, at=at, said_by=getuser())
-    return f"haul {written}: {what}"
 
 
 def digest(
@@ -160,7 +158,7 @@ def fleet(
         raise UserError(f"--out: expected a page such as fleet.html, got {out}")
     require_writable(out, memory, overwrite=overwrite, is_own=is_made_by("fleet"))
     states = read_memory(memory, load_boxes(boxes))
-    told = dict[str, str]()  # by address
+    printed = dict[str, str]()  # by address
     with stop_on_signals() as stop:
         while not stop.is_set():
             began_s = time.monotonic()
@@ -168,20 +166,20 @@ def fleet(
             page = fleet_page(states, title="Fleet", every_s=every, now_ns=time.time_ns())
             write_memory(memory, states)
             replace_text(out, page)
-            _print_changes(states, told)
+            _print_changes(states, printed)
             if not every or stop.wait(max(0.0, every - (time.monotonic() - began_s))):
                 break
 
 
-def _print_changes(states: "Iterable[BoxState]", told: dict[str, str]) -> None:
-    """A line for each box whose state or alarms are not those that were `told` last."""
+def _print_changes(states: "Iterable[BoxState]", printed: dict[str, str]) -> None:
+    """Print a line for each box whose state or alarms changed since they were `printed`."""
     for state in states:
         now = ": ".join(filter(None, (state.text, "; ".join(state.alarms))))
-        if told.get(state.box.address) != now:
+        if printed.get(state.box.address) != now:
             print(
                 f"{state.box.name}: {'; '.join(filter(None, (now, _figures(state))))}", flush=True
             )
-        told[state.box.address] = now
+        printed[state.box.address] = now
 
 
 def _figures(state: "BoxState") -> str:

@@ -54,7 +54,7 @@ def view(
 
     if screenshot is not None:
         require_writable(screenshot, overwrite=overwrite)
-    for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
+    for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with this
         signal.signal(number, lambda number, _: sys.exit(128 + number))
     selection = parse_selection(time, track)
     if frame is not None and "://" not in recording:
@@ -70,7 +70,7 @@ def view(
 
 
 def _require_frame(recording: Path, frame_index: int, selection: "Selection") -> None:
-    """Raise UserError where a recording lacks a frame; a view without messages may have it."""
+    """Raise UserError if a recording lacks a frame; a view without messages may have it."""
     from stream_dmr.errors import RecordingError
     from stream_dmr.recording.reading import open_recordings, require_frame
 
@@ -145,7 +145,7 @@ def _convert(
 
 @contextmanager
 def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Generator[str]:
-    """An .rrd or address as it is; of an .mcap, a part, or with a source, a new .rrd."""
+    """The given .rrd or address; for an .mcap, a part, or with a source, a new .rrd."""
     if "://" in recording:
         yield recording
         return
