@@ -47,9 +47,12 @@ def write_tables(folder: Path, job: Job) -> None:
     of_video = {"video": job.name, "haul": job.options.haul}
     checks = last_checks(folder / DATABASE)
     template = recording.header.template
-    records = [fish_record(one, template, settings, checks) | of_video for one in fish]
+    records = [fish_record(measured, template, settings, checks) | of_video for measured in fish]
     write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
-    by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
+    by_track = {
+        measured.estimate.track_id: {"run_id": measured.run_id} | asdict(measured.facts)
+        for measured in fish
+    }
     frames = read_records(folder / "frames.csv", FrameRow)
     records = [frame | of_video | by_track.get(frame["track_id"], {}) for frame in frames]
     write_parquet(folder / "frames.parquet", _FRAMES_SCHEMA, records)
@@ -59,8 +62,8 @@ def write_tables(folder: Path, job: Job) -> None:
 def publish(folder: Path, job: Job, out: Path) -> None:
     """Copy the tables of a finished video into the data set. Idempotent.
 
-    They are written again where a reviewer has added verdicts since, or the scale was checked, or
-    where one is gone.
+    They are written again if a reviewer has added verdicts or the scale was checked since, or if a
+    table is gone.
     """
     written_ns = min(_written_ns(folder, kind) for kind in TABLE_KINDS)
     if not written_ns or _last_addition_ns(folder) > written_ns:
@@ -89,17 +92,17 @@ def _target(out: Path, kind: str, job: Job) -> Path:
 
 
 def _written_ns(folder: Path, kind: str) -> int:
-    """When a table was written, ns since 1970; 0 where it is not there."""
+    """Time at which a table was written, ns since 1970; 0 if it is not there."""
     table = folder / f"{kind}.parquet"
     return table.stat().st_mtime_ns if table.exists() else 0
 
 
 def _last_addition_ns(folder: Path) -> int:
-    """When the last verdict or check of the scale came, ns since 1970; 0 without any."""
+    """Time of the last verdict or check of the scale, ns since 1970; 0 without any."""
     try:
         verdicts = read_verdicts(folder / DATABASE)
         checks = last_checks(folder / DATABASE).values()
     except OutputError:  # which `verify` reports
         return 0
-    times = [one.written_ns for one in verdicts] + [one.time_ns for one in checks]
+    times = [verdict.written_ns for verdict in verdicts] + [check.time_ns for check in checks]
     return max(times, default=0)

@@ -68,10 +68,10 @@ def run_batch(
     """Measure every video that is not done yet; results go below `out`.
 
     Failed videos are tried again by the next call. Setting `stop` ends the batch soon; unfinished
-    videos begin again with the next call. Raises OutputError where `out` can't be written to,
+    videos begin again with the next call. Raises OutputError if `out` can't be written to,
     another batch is writing there, it is a run's, or a folder in it holds files of the user.
     """
-    if (out / DATABASE).exists():  # whose fish reports and reviews would no longer show
+    if (out / DATABASE).exists():  # its fish would vanish from reports and reviews
         raise OutputError(
             f"{out}: expected a folder for a batch, found {DATABASE} of a run; choose another --out"
         )
@@ -96,12 +96,14 @@ def run_batch(
 
 
 class _BatchResults:
-    """The outcomes of all videos: writes videos.csv, and the data set of the finished ones."""
+    """The outcomes of all videos: writes videos.csv, and the data set of the finished videos."""
 
     def __init__(self, jobs: Sequence[Job], out: Path, log: Callable[[str], None]) -> None:
         self._jobs, self._out, self._log = jobs, out, log
         known = {job.name: read_outcome(job, out) for job in jobs}
-        self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
+        self.outcomes = {
+            name: outcome for name, outcome in known.items() if outcome and outcome.status == DONE
+        }
         for job in self._done():
             try:
                 publish(results_folder(job.name, out), job, out)
@@ -114,7 +116,7 @@ class _BatchResults:
         if outcome.status == DONE:
             publish(results_folder(job.name, self._out), job, self._out)
         else:
-            if read_outcome(job, self._out) is None:  # its process died before it could write one
+            if read_outcome(job, self._out) is None:  # its process died before it wrote that
                 folder = unfinished_folder(job.name, self._out)
                 shutil.rmtree(folder, ignore_errors=True)
                 finish_folder(folder, results_folder(job.name, self._out), outcome)
@@ -148,9 +150,9 @@ def _cells(job: Job, outcome: Outcome | None) -> tuple[object, ...]:
 
 
 def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:
-    """Raise OutputError where a folder that a batch replaces is not its own.
+    """Raise OutputError if a folder that a batch replaces is not its own.
 
-    It may be the very folder of pictures, or that of a video, that the manifest names.
+    It may be the very folder of pictures, or of a video, that the manifest names.
     """
     results = [results_folder(job.name, out) for job in jobs]
     strange = [f for f in results if f.exists() and not (f / OUTCOME).exists()]
@@ -163,9 +165,9 @@ def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:
 
 
 def _remove_unfinished(out: Path) -> None:
-    """Remove the folders that a killed batch left: empty ones, and those with files of a run.
+    """Remove the folders that a killed batch left, if they are empty or have files of a run.
 
-    Raises OutputError where another batch is still writing to one.
+    Raises OutputError if another batch is still writing to any of them.
     """
     for folder in out.glob(f"{VIDEO_FOLDERS}/*.part"):
         entries = list(folder.iterdir()) if folder.is_dir() else [folder]

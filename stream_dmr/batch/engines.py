@@ -52,8 +52,8 @@ def _read_stdin(jobs: queue.Queue[str]) -> None:
 
 _MAX_STDERR_BYTES = 300  # of a crashed process, for the table of videos: about two lines
 _POLL_S = 0.2  # how soon `stop` is seen
-# What a process has freed lies in pieces between what it keeps: some 5 MB more with each video. A
-# new one takes two seconds to start.
+# Memory that a process has freed lies in pieces between the memory that it keeps: some 5 MB more
+# with each video. A new process takes two seconds to start.
 _VIDEOS_A_PROCESS = 20
 
 
@@ -126,7 +126,7 @@ class _Worker:
             self._process.kill()
 
     def _measure(self, job: Job, on_progress: OnProgress) -> Outcome | None:
-        """The outcome of a job; None where `stop` ended its process."""
+        """The outcome of a job; None if `stop` ended its process."""
         process = self._process = self._process or self._start()
         assert process.stdin is not None
         assert process.stdout is not None
@@ -178,13 +178,13 @@ _RAY_POLL_S = 1.0  # how soon `stop` is seen
 
 
 class RayEngine:
-    """Ray Core: tasks with retries, and with fractional GPUs where asked for."""
+    """Runs tasks of Ray Core, with retries, and with fractional GPUs if asked for."""
 
     def __init__(self, *, address: str | None = None, gpus: float = 0.0) -> None:
-        """`address` of a cluster, "auto" for the one that this machine belongs to, None: a new one.
+        """`address` of a cluster; "auto": the cluster of this machine; None: a new cluster.
 
-        `gpus`: share of a GPU for each video. Raises UserError without the package, and
-        where the cluster can't be reached or has no GPUs though `gpus` asks for some.
+        `gpus`: share of a GPU for each video. Raises UserError without the package, and if the
+        cluster can't be reached or has no GPUs though `gpus` asks for some.
         """
         with requires_extra("ray", "--engine ray"):
             ray: Any = import_module("ray")
@@ -234,7 +234,7 @@ class RayEngine:
 
 
 def measure_on_worker(job: dict[str, Any], out: str) -> dict[str, Any]:
-    """Measure a job given as a dict, return its Outcome as one: plain values need no pickled class.
+    """Measure a job as a dict; return its Outcome as a dict: plain values need no pickled class.
 
     `out` is the batch's folder.
     """

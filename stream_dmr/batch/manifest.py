@@ -25,14 +25,14 @@ _FILES = (*COLUMNS[:4], "nmea")
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One video of a batch; workers get it as JSON."""
+    """A video of a batch; workers get it as JSON."""
 
     name: str  # of its folder; unique in the manifest
-    given: Mapping[str, str]  # options of its run by name, where there are any; paths are absolute
+    given: Mapping[str, str]  # options of its run by name, if given; paths are absolute
 
     @cached_property
     def options(self) -> RunOptions:
-        """The options of its run, with the default of all that is not given."""
+        """The options of its run, with defaults for those that are not given."""
         return options_of(RunOptions, self.given)
 
     @property
@@ -51,7 +51,7 @@ class Job:
 
     @property
     def num_bytes(self) -> int:
-        """Size of the video, from which the time left is estimated; 0 where it is no file."""
+        """Size of the video, from which the time left is estimated; 0 if it is no file."""
         path = Path(self.options.source)
         return path.stat().st_size if path.is_file() else 0
 
@@ -61,8 +61,8 @@ def read_manifest(
 ) -> list[Job]:
     """The jobs of a manifest; relative paths start from the manifest's folder.
 
-    Raises UserError where it can't be read or lacks its columns. Whether the files that it names
-    exist is not checked: a missing one fails its own video.
+    Raises UserError if it can't be read or lacks its columns. It is not checked that the files
+    that it names exist: a missing file fails its own video.
     """
     rows = _rows(path)
     names = _names([row["video"] or "" for row in rows])
@@ -85,7 +85,7 @@ def read_manifest(
 
 
 def repeated_videos(jobs: Sequence[Job]) -> list[str]:
-    """A line for each video that several rows name: its fish count once for each of them."""
+    """A line for each video that several rows name: its fish count once for each row."""
     counts = Counter(str(Path(job.options.source).resolve()) for job in jobs)
     return [
         f"{video}: in {count} rows of the manifest, so its fish count {count} times"
@@ -114,7 +114,7 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
 
 
 def _names(videos: list[str]) -> list[str]:
-    """A folder name for each video: its file's name, with a number where that occurs again.
+    """A folder name for each video: its file's name, with a number if the name occurs again.
 
     No name ends with `.part`, which marks an unfinished folder.
     """

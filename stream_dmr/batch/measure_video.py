@@ -31,7 +31,7 @@ from stream_dmr.web.watch_observer import WatchObserver
 
 _LOG_EVERY_S = 5.0  # between two lines of progress
 _MIN_SHARE = 0.01  # of the work, before a pace is estimated: the first frames also load and compile
-OnProgress = Callable[[float], None]  # takes the share of one video that is done, 0 to 1
+OnProgress = Callable[[float], None]  # takes the share of a video that is done, 0 to 1
 
 
 class BatchProgress:
@@ -45,7 +45,7 @@ class BatchProgress:
         self._began = self._logged = time.monotonic()
 
     def of(self, job: Job) -> OnProgress:
-        """The function that takes the share done of one video, from any thread."""
+        """The function that takes the share done of a video, from any thread."""
 
         def take(share: float) -> None:
             self._shares[job.name] = share
@@ -55,7 +55,7 @@ class BatchProgress:
     def finish(self, name: str) -> None:
         self._finished.add(name)
         self._shares[name] = 1.0
-        self._logged = -math.inf  # so that the next `update` says so
+        self._logged = -math.inf  # so that the next `update` logs a line
 
     def update(self) -> None:
         now = time.monotonic()
@@ -64,7 +64,7 @@ class BatchProgress:
             self._log(self.line(now - self._began))
 
     def line(self, elapsed_s: float) -> str:
-        """The videos over, the share of all bytes, and the time left at the pace so far."""
+        """The finished videos, the share of all bytes, and the time left at the pace so far."""
         total = max(1, sum(self._bytes.values()))
         share = sum(self._bytes[name] * done for name, done in self._shares.items()) / total
         over = f"{len(self._finished)} of {len(self._bytes)} videos"
@@ -75,7 +75,7 @@ class BatchProgress:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as text in s, min or h; two units would say more than an estimate knows."""
+    """Seconds as text in s, min or h; two units would be more exact than the estimate."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -83,7 +83,7 @@ def duration(seconds: float) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of a video; outcome.json holds these fields."""
+    """The outcome of a video; outcome.json holds these fields."""
 
     name: str  # of the job
     key: str  # of the job: an outcome counts while this is unchanged
@@ -101,10 +101,12 @@ class Outcome:
 
 
 def read_outcome(job: Job, out: Path) -> Outcome | None:
-    """The outcome of a job from an earlier call; None where it has none or its inputs changed."""
+    """The outcome of a job from an earlier call; None if it has none or its inputs changed."""
     folder, key = results_folder(job.name, out), job.key
     outcomes = (_read_file(folder / name) for name in (OUTCOME, FAILED_OUTCOME))
-    return next((one for one in outcomes if one is not None and one.key == key), None)
+    return next(
+        (outcome for outcome in outcomes if outcome is not None and outcome.key == key), None
+    )
 
 
 def _read_file(path: Path) -> Outcome | None:
@@ -136,8 +138,8 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
             num_frames=summary.num_frames,
             num_fish=len(summary.fish),
             elapsed_s=round(time.perf_counter() - began, 3),
-            species=dict(Counter(one.species_code for one in summary.fish if one.species_code)),
-            fates=dict(Counter(one.fate for one in summary.fish if one.fate)),
+            species=dict(Counter(fish.species_code for fish in summary.fish if fish.species_code)),
+            fates=dict(Counter(fish.fate for fish in summary.fish if fish.fate)),
         )
     except UserError as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -147,10 +149,11 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
 
 
 def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
-    """Write the outcome and rename the folder to `target`, in place of an earlier one.
+    """Write the outcome and rename the folder to `target`, in place of an earlier folder.
 
-    That one is renamed before it is removed: a process that is killed meanwhile leaves no part of
-    it under the name of results. A failure never replaces results: it is written beside them.
+    The earlier folder is renamed before it is removed: a process that is killed meanwhile leaves
+    no part of it under the name of results. A failure never replaces results: it is written beside
+    them.
     """
     before = _read_file(target / OUTCOME)
     if outcome.status == FAILED and before is not None and before.status == DONE:
@@ -159,7 +162,7 @@ def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
         return
     folder.mkdir(exist_ok=True)
     _write_outcome(folder / OUTCOME, outcome)
-    earlier = target.with_name(f".{target.name}.part")  # no job's name begins with a point
+    earlier = target.with_name(f".{target.name}.part")  # no job's name begins with a dot
     shutil.rmtree(earlier, ignore_errors=True)
     if target.exists():
         target.rename(earlier)
