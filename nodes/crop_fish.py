@@ -1,4 +1,4 @@
-"""CropFish: every fish of a frame, cut out through an ideal camera of its own; then who is gone."""
+"""CropFish: every fish of a frame, cut out through an ideal camera of its own; ends of tracks."""
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,10 +18,10 @@ from stream_dmr.tracking.tracker import TrackNumbering
 
 
 class CropFish:
-    """Frame -> FishCrop, one per fish, then TrackEnded of each that no later frame will show.
+    """Frame -> FishCrop of each fish, then TrackEnded of each fish that no later frame will show.
 
-    Where it becomes clear that something is a fish, its crops of earlier frames come before.
-    Without a calibrated camera a nominal one is assumed.
+    When a track is confirmed as a fish, its crops of earlier frames come first. Without a
+    calibrated camera a nominal camera is assumed.
     """
 
     def __init__(
@@ -33,9 +33,9 @@ class CropFish:
         species_model: str = "",
         track_timeout_s: float = 10.0,
     ) -> None:
-        """Raises ModelError where a model that the settings name cannot be used.
+        """Raises ModelError if a model that the settings name cannot be used.
 
-        The segmenter is not opened, and torch is not imported, where the finder gives all masks.
+        The segmenter is not opened, and torch is not imported, if the finder has all masks.
         `species_model`: the file of a classifier; "": none. Tracks of given ids end when they are
         unseen for `track_timeout_s`.
         """
@@ -46,7 +46,7 @@ class CropFish:
         self._settings = settings
         self._camera = camera
         self._timeout = TrackTimeout(track_timeout_s)
-        self._open: dict[int, int] = {}  # source ids by the track ids that were given
+        self._open: dict[int, int] = {}  # source ids by track id
         self._interrupted: list[int] = []  # track ids of an earlier run
         self._last: Frame | None = None
         # Networks run side by side; given masks are cut out mostly by Python, which can't.
@@ -54,7 +54,7 @@ class CropFish:
         self._map = map if self._segmenter is None else workers.map
 
     def number_after(self, track_id: int, *, interrupted: Collection[int] = ()) -> None:
-        """Number the fish on after those of earlier runs; call it before the first frame.
+        """Continue the numbers of the fish of earlier runs; call it before the first frame.
 
         Tracks that were open when an earlier run broke off end with the first frame.
         """
@@ -62,7 +62,7 @@ class CropFish:
         self._interrupted = sorted(interrupted)
 
     def step(self, frame: Frame, /) -> list[FishCrop | TrackEnded]:
-        """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
+        """The fish of a frame, by id. Raises AnnotationError for an unusable mask."""
         height, width = frame.image.shape[:2]
         camera = self._camera or Camera.nominal(width=width, height=height)
         cut = partial(
@@ -74,7 +74,8 @@ class CropFish:
         )
         found = self._finder.detect(frame)
         crops = {
-            one.source_id: crop for one, crop in zip(found, self._map(cut, found), strict=True)
+            detection.source_id: crop
+            for detection, crop in zip(found, self._map(cut, found), strict=True)
         }
         confirmed = self._finder.confirm(crops)
         fish = {self._numbering.track_id(source_id): source_id for source_id in confirmed}
@@ -83,20 +84,22 @@ class CropFish:
         return [*self._crops(fish, confirmed), *self._ends(frame, fish)]
 
     def pause(self) -> list[FishCrop | TrackEnded]:
-        """All open tracks end, unless their ids are given; the next frame shows other fish."""
+        """End all open tracks, unless their ids are given; the next frame shows other fish."""
         if not self._open or not isinstance(self._finder, TrackedFish):
             return []
         self._finder.forget_tracks()
         return self._end_all("pause")
 
     def close(self) -> list[FishCrop | TrackEnded]:
-        """All open tracks end with the source."""
+        """End all open tracks with the source."""
         return self._end_all("end")
 
     def _end_all(self, cause: str) -> list[FishCrop | TrackEnded]:
         last, ended = self._last, [*self._open]
         self._open.clear()
-        return [] if last is None else [TrackEnded.after(last, one, cause) for one in ended]
+        return (
+            [] if last is None else [TrackEnded.after(last, track_id, cause) for track_id in ended]
+        )
 
     def _crops(
         self, fish: Mapping[int, int], shown: Mapping[int, Sequence[FishCrop]]

@@ -27,9 +27,9 @@ class FitMesh:
         with_covariance: bool = False,
         species: SpeciesSettings | None = None,
     ) -> None:
-        """`candidates`: shapes of which each fish gets the one that its masks prefer.
+        """`candidates`: shapes of which each fish gets the shape that its masks prefer.
 
-        A fish whose `species` is sure gets that of its species' body form, where there is one.
+        A fish whose `species` is sure gets the shape of its species' body form, if there is one.
         """
         self._tracks = TrackFitter(
             template,
@@ -41,11 +41,11 @@ class FitMesh:
         )
 
     def learn(self, candidates: CandidateShapes) -> None:
-        """Take what a camera has learnt, for the fish that it sees from then on."""
+        """Take the shapes learnt from a camera's fish, for the fish that it sees from then on."""
         self._tracks.learn(candidates)
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
-        """Fit one crop; what can't be fitted is passed on with its reason."""
+        """Fit a crop; a crop that can't be fitted is passed on with its reason."""
         self._tracks.forget(before_ns=crop.timestamp_ns - _FORGET_NS)
         return [self._tracks.fit(crop)]
 

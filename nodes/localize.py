@@ -11,14 +11,14 @@ from stream_dmr.messages import FittedMesh, LocalizedFish
 
 
 class Localize:
-    """Holds the calibration; frames don't depend on each other. Without one: no millimetres."""
+    """Holds the calibration, without which there are no millimetres; each frame stands alone."""
 
     def __init__(self, settings: LocalizeSettings, *, calibration: Calibration | None) -> None:
         self._settings = settings
         self._calibration = calibration
 
     def step(self, message: FittedMesh, /) -> Sequence[LocalizedFish]:
-        """One LocalizedFish for every fit, refused ones included."""
+        """A LocalizedFish for every fit, also for a refused fit."""
         return [localize(message, settings=self._settings, calibration=self._calibration)]
 
     def close(self) -> Sequence[LocalizedFish]:

@@ -12,21 +12,21 @@ class ReadFrames:
     """Frames of a source, to be iterated once; `source` has its size, rate and warnings."""
 
     def __init__(self, source: str, settings: ReadFramesSettings) -> None:
-        """Raises SourceError where nothing can be read from `source`."""
+        """Raises SourceError if nothing can be read from `source`."""
         self.source = open_source(source, settings)
         self._frames: Iterable[Frame] = self.source
         self._offset = 0
 
     def number_after(self, frame_index: int) -> None:
-        """Number the frames on after those of earlier runs; call it before the iteration."""
+        """Continue the frame numbers of earlier runs; call it before the iteration."""
         self._offset = frame_index
 
     def give_again(self, frames: Iterable[Frame]) -> None:
-        """The next iteration gives these, which the source has given before and was closed."""
+        """Iterate over these frames next; the source returned them before and is closed."""
         self._frames = frames
 
     def __iter__(self) -> Iterator[Frame]:
-        """Raises SourceError where a frame doesn't fit those before it."""
+        """Raises SourceError if a frame doesn't fit the frames before it."""
         for frame in self._frames:
             yield replace(frame, frame_index=frame.frame_index + self._offset)
 

@@ -1,7 +1,7 @@
-"""SmoothLength: from the lengths of frames to that of a fish, its species and what became of it.
+"""SmoothLength: from the lengths of frames to the length, species and fate of a fish.
 
-Last of the chain: LocalizedFish -> LengthEstimate, one running estimate for every frame of a fish
-and a final one when its track ends.
+Last of the chain: LocalizedFish -> LengthEstimate, a running estimate for every frame of a fish
+and a final estimate when its track ends.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class SmoothLength:
     ) -> None:
         """With `zones` a final estimate has a fate; `frame_size`: width and height, px.
 
-        It has a species where a classifier has looked at the fish; `tail_gives`: see Template.
+        It has a species if a classifier has seen the fish; `tail_gives`: see Template.
         """
         self._settings = settings
         self._zones, self._frame_size = zones or ZonesSettings(), frame_size
@@ -50,7 +50,7 @@ class SmoothLength:
         self._last: LocalizedFish | None = None
 
     def step(self, message: LocalizedFish, /) -> Sequence[LengthEstimate]:
-        """Return the running estimate of this fish after one more frame."""
+        """Return the running estimate of this fish after a further frame."""
         self._last = message
         if message.track_id in self._ended:
             return [late_estimate(message)]
@@ -70,11 +70,11 @@ class SmoothLength:
         return [self._finish(ended)] if ended.track_id in self._open else []
 
     def close(self) -> Sequence[LengthEstimate]:
-        """Finish the tracks whose end did not come here, since the chain was stopped."""
+        """Finish the tracks whose end was lost, since the chain was stopped."""
         last = self._last
         if last is None:
             return []
-        return [self._finish(TrackEnded.after(last, one, "end")) for one in [*self._open]]
+        return [self._finish(TrackEnded.after(last, track_id, "end")) for track_id in [*self._open]]
 
     def _finish(self, ended: TrackEnded) -> LengthEstimate:
         self._ended.add(ended.track_id)
