@@ -47,7 +47,7 @@ def prepare_folder(
 ) -> list[Repair]:
     """Make sure that results can be written to `out`, and that no earlier ones are lost.
 
-    Raises OutputError where it is no folder, can't be written to, has no room, is that of a batch
+    Raises OutputError if it is no folder, can't be written to, has no room, is that of a batch
     or of exports, or holds results of an earlier run; `overwrite` removes those instead, `resume`
     keeps them. With `waits_for_room` a full disk is no error. Returns the repairs of recordings
     that a crash left unfinished.
@@ -126,7 +126,7 @@ def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
 
 
 def _recordings(out: Path, pattern: str) -> list[Path]:
-    """Recordings, whole or unfinished; a video of the user may be called so as well."""
+    """Recordings, whole or unfinished; a user's video may have such a name as well."""
     return sorted(path for path in out.glob(pattern) if {".mcap", ".rrd"} & {*path.suffixes})
 
 
@@ -136,8 +136,8 @@ FROM_RECORDING = "taken over from the recording"
 def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
     """Repair recordings, add lengths that only they hold to lengths.db; yield a line for each.
 
-    With a device key what was repaired and taken over is signed, as found. Raises OutputError where
-    `folder` is no folder or another run is writing to it, UserError where the key is none.
+    With a device key, what was repaired and taken over is signed, as found. Raises OutputError if
+    `folder` is no folder or another run is writing to it, UserError if the key is invalid.
     """
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
@@ -158,7 +158,7 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
 def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
     try:
         recording = open_recordings([path])
-        final = [one for one in messages_of(recording, LengthEstimate) if one.is_final]
+        final = [length for length in messages_of(recording, LengthEstimate) if length.is_final]
     except RecordingError as error:
         yield str(error)
         return

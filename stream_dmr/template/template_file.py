@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from stream_dmr.errors import OutputError, TemplateError, reason_of
-from stream_dmr.files import read_text
+from stream_dmr.errors import TemplateError, reason_of
+from stream_dmr.files import read_text, writing_to
 from stream_dmr.template.fish_outline import find_points
 from stream_dmr.template.mesh_repair import repair_mesh
 from stream_dmr.template.template import JOINTS, Template, canonical_template
@@ -86,14 +86,10 @@ def save_template(template: Template, path: Path, *, comment: str) -> None:
         if template.total_per_fork is not None:
             lines.append(f"total_per_fork = {template.total_per_fork}")
     mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
-    try:
+    with writing_to(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
         mesh.export(path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: can't be written: {error.strerror}; give another --out"
-        ) from error
 
 
 def bundled_names() -> list[str]:

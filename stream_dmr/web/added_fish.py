@@ -1,4 +1,4 @@
-"""Fish that a reviewer adds, splits and merges; added fish are measured."""
+"""Add, split and merge fish for a reviewer; added fish are measured."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +40,7 @@ Boxes = Mapping[int, Float[np.ndarray, "4"]]  # by frame index: x0, y0, x1, y1 i
 def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
     """The boxes of all `frame_indices` from the first drawn box to the last.
 
-    Corners move evenly from one drawn box to the next.
+    Between two drawn boxes, corners move evenly.
     """
     known = sorted(drawn)
     corners = np.array([drawn[frame_index] for frame_index in known], float)
@@ -59,9 +59,9 @@ def measure_boxes(
 ) -> tuple[list[AddedFrame], list[LocalizedFish], bool]:
     """Cut out, segment, fit and localize the fish of the boxes, as in `run --boxes`.
 
-    `found` are the frames from the first box to the last. Shapes are those that the run was given
-    or has learnt. Returns the frames to store, the fish in them, and True if they were measured on
-    the very pixels of the run. Raises UserError if there are no pictures.
+    `found` are the frames from the first box to the last. The shapes are the run's, given or
+    learnt. Returns the frames to store, the fish in them, and True if they were measured on the
+    pixels of the run itself. Raises UserError if there are no pictures.
     """
     pictures = [shown for shown in found if shown.frame.image.size]
     boxes = boxes_between(drawn, [shown.frame.frame_index for shown in pictures])
@@ -103,7 +103,7 @@ def measure_boxes(
 
 
 class DoubtError(UserError):
-    """A question: an edit contradicts measurements. If submitted again as `sure`, it is made."""
+    """A question: the edit contradicts measurements. It is made if submitted again as `sure`."""
 
 
 def require_equal_lengths(measured: Mapping[int, LengthEstimate], merge: Verdict) -> None:
@@ -146,7 +146,10 @@ class TrackEditor:
         self._pictures = pictures
 
     def split(self, report: RunReport, verdict: Verdict) -> TrackEdit:
-        """From `verdict.frame_index` on it is another fish. UserError if a part has no frames."""
+        """Make a new fish of the frames from `verdict.frame_index` on.
+
+        Raises UserError if a part has no frames.
+        """
         track_id, frame_index = verdict.track_id, verdict.frame_index
         new_fish = self._new_fish()
         if frame_index is None:
@@ -163,7 +166,7 @@ class TrackEditor:
         return TrackEdit(verdict=made, new_fish=new_fish)
 
     def merge(self, report: RunReport, verdict: Verdict) -> TrackEdit:
-        """`verdict.other_fish` becomes part of this fish; UserError if both are in view at once."""
+        """Make this fish part of `verdict.other_fish`. UserError if both are in view at once."""
         self._refuse_beside_a_run()
         other = verdict.other_fish
         there = {fish.estimate.track_id for fish in report.fish} - report.edits.merged.keys()
@@ -195,7 +198,7 @@ class TrackEditor:
     def add(
         self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
     ) -> TrackEdit:
-        """A fish that was missed, measured in the drawn boxes; `time_ns`: of the first and last."""
+        """Measure a missed fish in the drawn boxes; `time_ns`: times of the first and last box."""
         new_fish = self._new_fish()
         frames, fish, is_original = measure_boxes(
             list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
@@ -228,9 +231,10 @@ class TrackEditor:
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
             chosen = frames_of_parts(frames, of_fish, fish=fish)
-            known = [flags.get(fish, ()), *(flags.get(part.track_id, ()) for part in of_fish)]
-            said = list(dict.fromkeys(flag for some in known for flag in some))
-            rows.append(edited_row(chosen, report.config.smooth_length, said))
+            known = [*flags.get(fish, ())]
+            known += [flag for part in of_fish for flag in flags.get(part.track_id, ())]
+            kept = list(dict.fromkeys(known))
+            rows.append(edited_row(chosen, report.config.smooth_length, kept))
         return rows
 
     def _new_fish(self) -> int:

@@ -1,4 +1,4 @@
-"""How well readings of the same fish agree: decisions, species and lengths."""
+"""Compare readings of the same fish: decisions, species and lengths."""
 
 import math
 from collections import Counter
@@ -18,11 +18,11 @@ _Fish = tuple[str, int]  # folder and track id
 
 @dataclass(frozen=True, kw_only=True)
 class LabelAgreement:
-    """Labels that two readers gave to the same things."""
+    """The agreement of two readers' labels for the same fish."""
 
     count: int
     same: int
-    kappa: float | None  # Cohen's; None if both always give the same label
+    kappa: float | None  # Cohen's; None without labels, or if all are equal
 
     @property
     def text(self) -> str:
@@ -38,7 +38,7 @@ class LengthAgreement:
 
     count: int
     mean_mm: float | None
-    limits_mm: tuple[float, float] | None  # of agreement, 95 %; None of fewer than two fish
+    limits_mm: tuple[float, float] | None  # of agreement, 95 %; None for fewer than two fish
 
     @property
     def text(self) -> str:
@@ -63,7 +63,7 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingPair:
-    """How well two readings agree."""
+    """The agreement of two readings."""
 
     first: str
     second: str
@@ -75,9 +75,9 @@ class ReadingPair:
 def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> float | None:
     """Agreement beyond chance: (p_o - p_e) / (1 - p_e).
 
-    p_o is the share of equal labels, p_e the share by chance if each reader gives every label as
-    often as observed. None without labels or if p_e is 1. Cohen, "A Coefficient of Agreement for
-    Nominal Scales", Educational and Psychological Measurement 20 (1960).
+    p_o is the share of equal labels; p_e is that share by chance, if each reader uses every label
+    as often as observed. None without labels or if p_e is 1. Cohen, "A Coefficient of Agreement
+    for Nominal Scales", Educational and Psychological Measurement 20 (1960).
     """
     count = len(first)
     if count == 0:
@@ -103,10 +103,10 @@ def length_agreement(differences_mm: Sequence[float]) -> LengthAgreement:
 
 
 def agreements(folders: Sequence[Path]) -> list[ReadingPair]:
-    """Each pair of readings of the fish of some runs: the review, and each blind reading.
+    """The agreement of each pair of readings of the fish of some runs.
 
-    The measurement itself is beside them with its lengths. Raises UserError if there are no two
-    readings.
+    Readings are the review, each blind reading, and the measurement with its lengths. Raises
+    UserError if there are fewer than two.
     """
     readings = [
         reading
@@ -134,9 +134,9 @@ def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
             if caught.estimate.length_mm is not None:
                 measured[str(folder), caught.estimate.track_id] = caught.estimate.length_mm
         verdicts = read_verdicts(database)
-        said = {REVIEW: verdicts} | blind_readings(verdicts)
-        for name, of_reader in said.items():
-            found = reviews_of(of_reader)
+        by_reader = {REVIEW: verdicts} | blind_readings(verdicts)
+        for name, own_verdicts in by_reader.items():
+            found = reviews_of(own_verdicts)
             known = {(str(folder), track): r for track, r in found.items() if track in there}
             reviews.setdefault(name, {}).update(known)
     yield Reading(name=MEASUREMENT, lengths_mm=measured)

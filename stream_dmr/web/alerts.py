@@ -1,4 +1,4 @@
-"""Tells people, by a webhook or apprise, when a run becomes unhealthy, and healthy again."""
+"""Alert people, by a webhook or apprise, when a run becomes unhealthy, and healthy again."""
 
 import json
 import re
@@ -14,8 +14,8 @@ from stream_dmr.errors import ConfigError, reason_of, requires_extra
 from stream_dmr.files import read_secret
 from stream_dmr.pipeline.config import AlertSettings
 
-_LOOK_S = 2.0  # between two looks at the health
-_SETTLE_LOOKS = 3  # equal looks after which a change counts: a camera that blinks is no news
+_LOOK_S = 2.0  # between two checks of the health
+_SETTLE_LOOKS = 3  # equal checks after which a change counts: a camera that blinks is no news
 _TIMEOUT_S = 10.0  # of a delivery
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 3600.0  # after a delivery that failed: doubled each time
 
@@ -67,17 +67,17 @@ class AlertSender:
         self._thread.join(_TIMEOUT_S)
 
     def _watch(self) -> None:
-        told: list[str] = []  # the kinds of problems that were sent last
+        sent: list[str] = []  # the kinds of problems in the last alert
         seen, num_equal = list[str](), 0
         while not self._ended.wait(self._look_s):
             problems = list(self._problems())
             kinds = _kinds(problems)
             num_equal, seen = (num_equal + 1 if kinds == seen else 1), kinds
-            if kinds != told and num_equal >= _SETTLE_LOOKS and self._send(problems):
-                told = kinds
+            if kinds != sent and num_equal >= _SETTLE_LOOKS and self._send(problems):
+                sent = kinds
 
     def _send(self, problems: Sequence[str]) -> bool:
-        """Deliver by every way; False if the health changed or the run ended before."""
+        """Send an alert to all addresses; False if the health changes or the run ends before."""
         alert = Alert(
             run=self._run,
             healthy=not problems,
@@ -127,7 +127,7 @@ def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
 
 
 def _post(address: str, alert: Alert) -> None:
-    """POST it as JSON; chat services show its `text`."""
+    """POST an alert as JSON; chat services show its `text`."""
     content = json.dumps(asdict(alert) | {"text": alert.title}).encode()
     request = urllib.request.Request(address, content, {"Content-Type": "application/json"})
     with urllib.request.urlopen(request, timeout=_TIMEOUT_S):
@@ -135,7 +135,7 @@ def _post(address: str, alert: Alert) -> None:
 
 
 def _services(file: str) -> Iterator[Callable[[Alert], None]]:
-    """One per address of the file. No message holds an address, which may hold a password."""
+    """A delivery for each address of the file. No message contains an address or its password."""
     with requires_extra("alerts", "[alerts] apprise_file"):
         from apprise import Apprise, NotifyFormat, NotifyType
     where = "[alerts] apprise_file"

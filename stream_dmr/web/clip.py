@@ -19,16 +19,16 @@ from stream_dmr.store.fish import database_of
 from stream_dmr.web.report_page import RunReport
 from stream_dmr.web.views import mask_outlines
 
-# Margin before and after a fish, which shows what becomes of it, and the longest clip. Chosen.
+# Margin before and after a fish, which shows its fate, and the longest clip. Chosen.
 _MARGIN_NS, _MAX_NS = 1_000_000_000, 10_000_000_000
 _MAX_WIDTH_PX = 960  # of a picture that is sent; the page's canvas is no wider
 _JPEG_QUALITY = 80
 
 
 def clip_span_ns(report: RunReport, track_id: int, shift: int) -> tuple[int, int]:
-    """First capture time (included) and last (excluded) of a clip.
+    """Capture times at which a clip begins (included) and ends (excluded).
 
-    `shift`: so many clips later, or earlier if negative. UserError without such a fish.
+    `shift`: number of clips later, or earlier if negative. UserError without such a fish.
     """
     for fish in report.fish:
         if fish.estimate.track_id == track_id:
@@ -42,10 +42,11 @@ def clip_span_ns(report: RunReport, track_id: int, shift: int) -> tuple[int, int
 def fish_clip(
     report: RunReport, pictures: FrameLookup, track_id: int, *, shift: int = 0
 ) -> Iterator[bytes]:
-    """Chunks, each after its size as four bytes (little-endian): for each frame JSON and JPEG.
+    """Chunks of a clip: for each frame its JSON, then its JPEG.
 
-    The JSON has the frame's number, time, size and outlines; the JPEG is empty if neither the
-    source nor the recording has the picture. UserError without such a fish.
+    Four bytes (little-endian) with its size come before each chunk. The JSON has the frame's
+    number, time, size and outlines; the JPEG is empty if neither the source nor the recording has
+    the picture. UserError without such a fish.
     """
     return _chunks(report, pictures, clip_span_ns(report, track_id, shift))
 
@@ -83,7 +84,7 @@ def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dic
             drawn["reason"] = message.reason
             if message.keypoints_px is not None:  # None: the fit was refused
                 drawn["points"] = np.round(message.keypoints_px, 1).tolist()
-    return {frame: [of[fish] for fish in sorted(of)] for frame, of in frames.items()}
+    return {frame: [by_fish[fish] for fish in sorted(by_fish)] for frame, by_fish in frames.items()}
 
 
 def _mask_lines(crop: FishCrop) -> list[list[float]]:

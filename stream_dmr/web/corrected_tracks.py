@@ -1,8 +1,9 @@
 """Turn the corrections in a VIAME CSV of a run into verdicts and edits, as `review` makes them.
 
-A row belongs to the fish with its box, not to the number of its track, which DIVE changes. A box
-without a fish was drawn. Frames of a fish in other tracks are split off and merged with those;
-frames in no track are split off and rejected.
+A row belongs to the fish with the same box. Its track number does not count, since DIVE changes
+it. A box without a fish is part of a drawn fish, which is added. If frames of a fish are in another
+track, they are split off and merged with that track's fish; frames in no track are split off and
+rejected.
 """
 
 import json
@@ -46,17 +47,17 @@ from stream_dmr.web.views import recorded_source
 
 _MOVED_PX = 1.0  # DIVE rounds boxes and points to whole pixels
 _SAME_OUTLINE = 0.8  # intersection over union, chosen: of small fish that were rounded as well
-_NO_SPECIES = ("", NO_SPECIES, "unknown")  # the last is DIVE's name for a new track
+_NO_SPECIES = ("", NO_SPECIES, "unknown")  # "unknown" is DIVE's species of a new track
 
 
 def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list[str], list[str]]:
     """Write the verdicts that follow from a corrected file; returns them and doubts, in words.
 
-    All are tried on a copy first, so that an error leaves the folder as it was. Raises a UserError.
+    All are tried on a copy first, so an error leaves the folder unchanged. Raises UserError.
     """
     database = require_database(report)
     require_recording(report.recording, where=report.path, what="an import")
-    said = read_verdicts(database)
+    before = read_verdicts(database)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / database.name
         copy_database(database, copy)
@@ -64,7 +65,7 @@ def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list
         with closing(recorder.pictures):
             corrections = _Corrections(recorder, _Comparison(report, path))
             corrections.make()
-        made = read_verdicts(copy)[len(said) :]
+        made = read_verdicts(copy)[len(before) :]
         added = read_added_frames(copy)
         frames = [
             frame for verdict in made if verdict.kind == "add" for frame in added[verdict.track_id]
@@ -72,7 +73,7 @@ def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list
         new = [*added, *(verdict.other_fish or 0 for verdict in made if verdict.kind == "split")]
         last = max(new, default=None)
     if made:
-        add_verdict(database, *made, frames=frames, new_fish=last, known=len(said))
+        add_verdict(database, *made, frames=frames, new_fish=last, known=len(before))
         seal_verdicts(database.parent)
     return [f"fish {verdict.track_id}: {verdict.in_words}" for verdict in made], corrections.doubts
 
@@ -84,7 +85,7 @@ class _Comparison:
         recorded = messages_of(report.recording, Frame)
         self.path = path
         self.times_ns = {frame.frame_index: frame.timestamp_ns for frame in recorded}
-        # By fish and frame: the track of the file that has its box; None: none has.
+        # By fish and frame: the file's track with the fish's box; None if no track has it.
         self.track_of = defaultdict[int, dict[int, int | None]](dict)
         self.drawn = defaultdict[int, dict[int, AnnotatedBox]](dict)  # by track and frame
         # By track and frame: the new places of moved heads and tails, in pixels of the crop.
@@ -95,7 +96,7 @@ class _Comparison:
         pictures = None if source is None else Path(source)
         rows = load_boxes(path, pictures=pictures, parse=_parse_whole)
         database = require_database(report)
-        # Fish and frames of boxes that were drawn before: their points were found anew.
+        # Fish and frames of boxes drawn before: their head and tail were found anew.
         self._found_anew = {
             (report.edits.fish_of(track_id, frame.frame_index), frame.frame_index)
             for track_id, frames in read_added_frames(database).items()
@@ -124,7 +125,7 @@ class _Comparison:
     ) -> None:
         crops = {crop.track_id: crop for crop in found}
         left_out = {k for k in crops if k not in self._fish or not self._fish[k].counts}
-        near = sorted(  # the same number first, if fish have equal boxes
+        near = sorted(  # if fish have equal boxes, a pair with the same number comes first
             (track_id in left_out, track_id != box.track_id, shift_px, track_id, number)
             for track_id, crop in crops.items()
             for number, box in enumerate(boxes)
@@ -188,7 +189,7 @@ def _parse_whole(text: str, path: Path, pictures: Sequence[Path]) -> dict[int, l
 
 
 class _Corrections:
-    """Makes the verdicts that turn the fish of a run into those of a file."""
+    """Makes the verdicts that turn the fish of a run into the fish of a file."""
 
     def __init__(self, recorder: VerdictRecorder, file: _Comparison) -> None:
         self._recorder, self._file = recorder, file
@@ -197,28 +198,30 @@ class _Corrections:
     def make(self) -> None:
         pieces = self._split()
         for track, boxes in self._file.drawn.items():
-            pieces[track] += [self._say("add", boxes=drawn).track_id for drawn in self._runs(boxes)]
+            pieces[track] += [
+                self._submit("add", boxes=drawn).track_id for drawn in self._runs(boxes)
+            ]
         for track, fish in pieces.items():
             kept = track if track in fish else fish[0]
             for other in fish:
                 if other != kept:
-                    self._say("merge", other, other_fish=kept)
+                    self._submit("merge", other, other_fish=kept)
             self._name(kept, track)
             for (moved, frame_index), (head, tail) in self._file.moved.items():
                 if moved == track:
-                    self._say("correct", kept, frame_index=frame_index, head=head, tail=tail)
+                    self._submit("correct", kept, frame_index=frame_index, head=head, tail=tail)
 
     def _split(self) -> dict[int, list[int]]:
-        """Split fish where their track changes, reject frames in no track; the rest by track."""
+        """Split fish at each change of track and reject frames in no track; the rest by track."""
         pieces = defaultdict[int, list[int]](list)
         for fish, track_of in self._file.track_of.items():
             for number, (track, frames) in enumerate(groupby(track_of, key=track_of.__getitem__)):
                 if number:
-                    fish = self._say("split", fish, frame_index=next(frames)).other_fish or 0
+                    fish = self._submit("split", fish, frame_index=next(frames)).other_fish or 0
                 if track is not None:
                     pieces[track].append(fish)
                 else:
-                    self._say("reject", fish, reason=f"not in {self._file.path.name}")
+                    self._submit("reject", fish, reason=f"not in {self._file.path.name}")
         return pieces
 
     def _runs(self, boxes: Mapping[int, AnnotatedBox]) -> Iterator[list[dict[str, Any]]]:
@@ -244,13 +247,13 @@ class _Corrections:
                 f"{' and '.join(sorted(named)) or 'none'}"
             )
         if named - {before}:
-            self._say("species", fish, species=named.pop())
+            self._submit("species", fish, species=named.pop())
 
-    def _say(self, kind: str, track_id: int = 0, **said: object) -> Verdict:
-        submitted = {"kind": kind, "track_id": track_id, **said}
+    def _submit(self, kind: str, track_id: int = 0, **values: object) -> Verdict:
+        submitted = {"kind": kind, "track_id": track_id, **values}
         try:
             self._record(submitted)
-        except DoubtError as doubt:  # who corrected the file has looked
+        except DoubtError as doubt:  # the person who corrected the file has looked
             self.doubts.append(str(doubt))
             self._record(submitted | {"sure": True})
         verdict = self._recorder.last()

@@ -1,4 +1,4 @@
-"""Digests: a small signed file for each day of a run, sent ashore over a thin link."""
+"""Write digests: a small signed file for each day of a run, sent ashore over a slow link."""
 
 import shutil
 import threading
@@ -42,7 +42,7 @@ _PICTURE_PX, _WEBP_QUALITY = 64, 50
 FISH_COLUMNS = ("id", "utc", "length_mm", "low_mm", "high_mm", "species", "status", "haul", "fate")
 _WRITTEN = "digest"  # the kind of event that notes a written digest
 _DAY_NS, _EPOCH = 86_400_000_000_000, date(1970, 1, 1)
-_SETTLE_NS = 600_000_000_000  # after a day's end: a row of `watched` takes five minutes
+_SETTLE_NS = 600_000_000_000  # wait after a day's end: a row of `watched` spans five minutes
 _LOOK_S, _NEVER = 300.0, threading.Event()
 
 
@@ -59,10 +59,11 @@ def write_digest(
     problems: Sequence[str] = (),
     stop: threading.Event = _NEVER,
 ) -> int:
-    """Write the digest of a UTC day: of the fish whose tracks ended on it, as measured.
+    """Write the digest of a UTC day, with the fish whose tracks ended on it, as measured.
 
-    `problems`: of the run, now. `stop`: leaves out pictures that are not made yet. Returns its
-    bytes, more than MAX_BYTES only for rows of fish. OutputError if nothing is known of the day.
+    `problems`: of the run, now. If `stop` is set, the remaining pictures are left out. Returns the
+    size in bytes; only the rows of fish can make it exceed MAX_BYTES. Raises OutputError if the
+    run has no data of the day.
     """
     days, zero_ns = _days(folder / DATABASE)
     if day not in days:
@@ -87,7 +88,7 @@ def write_digest(
 
 
 def _days(database: Path) -> tuple[Counter[date], int]:
-    """The number of fish of each watched UTC day; the offset of UTC to capture times, ns."""
+    """The number of fish of each watched UTC day, and the offset of UTC to capture times, ns."""
     zeros, found = [facts.utc_zero_ns for facts in read_runs(database).values()], Counter[date]()
     if not zeros or (zero_ns := zeros[-1]) is None:
         raise OutputError(
@@ -107,7 +108,7 @@ def _day_of(utc_ns: int) -> date:
 def _content(
     database: Path, span: Haul, fish: Sequence[Fish], zero_ns: int, problems: Sequence[str]
 ) -> dict[str, Any]:
-    """The rows of a day in lengths.db."""
+    """The content of a digest from lengths.db: summary, hauls, events, positions and fish."""
     facts, efforts = [*read_runs(database).values()][-1], read_effort(database, fish, span=span)
     hours = sum(effort.hours_watched for effort in efforts)
     if (scale := last_checks(database).get(facts.calibration_sha256)) and scale.alarm:
@@ -162,7 +163,7 @@ def _fish_row(fish: Fish) -> list[object]:
 
 
 def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
-    """The closed recordings that began in a time, each after the time of its first frame."""
+    """The closed recordings that began in `span`: time of the first frame, ns, and path."""
     files, found = list[Path](), list[tuple[int, Path]]()
     with suppress(RecordingError):
         files = [path for path in files_of(folder) if path.suffix in (".mcap", ".rrd")]
@@ -177,9 +178,10 @@ def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
 
 
 def grouped_sums(paths: Sequence[Path], *, most: int = _MAX_RECORDINGS) -> list[list[str]]:
-    """Name and SHA-256 of each file; above `most`, first name, last name and SHA-256 of groups.
+    """Name and SHA-256 of each file.
 
-    A group's SHA-256 is of the output of `sha256sum` for its files.
+    More than `most` files are put into groups: first name, last name, and the SHA-256 of the output
+    of `sha256sum` for the group's files.
     """
     size = max(1, -(-len(paths) // most))
     if size == 1:
@@ -191,13 +193,13 @@ def grouped_sums(paths: Sequence[Path], *, most: int = _MAX_RECORDINGS) -> list[
 def _pictures(
     fish: Sequence[Fish], recordings: Sequence[tuple[int, Path]], stop: threading.Event
 ) -> Iterator[tuple[str, bytes]]:
-    """Name and WebP of each fish that a recording shows, by its best frame; the best fits first."""
+    """Name and WebP of the best frame of each recorded fish; the fish with the best fits first."""
     for caught in sorted(fish, key=lambda caught: -(caught.iou or 0.0)):
         track_id = caught.estimate.track_id
         index = bisect_right(recordings, caught.middle_ns, key=lambda recording: recording[0])
         with suppress(UserError):  # a damaged recording
             if stop.is_set() or not index:
-                continue  # index 0: in a recording that began the day before
+                continue  # index 0: the recording began the day before
             recording = open_recordings([recordings[index - 1][1]])
             selection = Selection(tracks=frozenset([track_id]))
             tracks = read_tracks(ReviewedMessages(recording, None, selection), max_views=1)
@@ -212,9 +214,9 @@ def _pictures(
 class DailyDigests:
     """Writes the digest of each day of a run when it is over, in a thread of its own.
 
-    Each written digest is an event in lengths.db, so that neither an emptied folder nor a restart
-    nor days without power lose or repeat a day. A day is written again, by the same name, only if a
-    fish of it came later, such as a fish that a crash interrupted.
+    Each written digest is an event in lengths.db, so an emptied folder, a restart or days without
+    power neither lose nor repeat a day. A day is written again, by the same name, only if one of
+    its fish came later, such as a fish that a crash interrupted.
     """
 
     def __init__(
@@ -227,7 +229,7 @@ class DailyDigests:
         problems: Callable[[], Sequence[str]],
         on_notice: Callable[[str], None],
     ) -> None:
-        """`now_ns`: up to which time, since 1970, all is measured. `problems`: of the run."""
+        """`now_ns`: time up to which all is measured, since 1970. `problems`: of the run."""
         self._folder, self._store, self._signer = folder, store, signer
         self._now_ns, self._problems, self._on_notice = now_ns, problems, on_notice
         self._ended = threading.Event()
@@ -243,10 +245,10 @@ class DailyDigests:
         """Write the missing digests of past days. Raises OutputError."""
         out, today = self._store.path.parent, _day_of(self._now_ns() - _SETTLE_NS)
         events = read_rows(self._store.path, EVENTS)
-        told = {row["text"] for row in events if row["kind"] == _WRITTEN}
+        written = {row["text"] for row in events if row["kind"] == _WRITTEN}
         for day, count in sorted(_days(self._store.path)[0].items()):
             path, text = self._folder / digest_name(day), f"digest of {day}: {count} fish"
-            if day >= today or text in told or self._ended.is_set():
+            if day >= today or text in written or self._ended.is_set():
                 continue
             make_folder(self._folder)
             require_writable(path, is_own=is_made_by("digest"))

@@ -1,4 +1,4 @@
-"""One page about all boxes of a fleet, by their status pages or their digests."""
+"""Make one page about all boxes of a fleet, from their status pages or digests."""
 
 import json
 import time
@@ -45,19 +45,20 @@ _ORDER = tuple(reversed(_WORDS))  # boxes with problems come first
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box: its status page's address, which ends in "/", and the token that it asks for.
+    """A box, by the address of its status page or of its digests.
 
-    Or the address of a digest, or of the folder that gets its digests, with file://.
+    The address of a status page ends in "/"; the address of a digest, or of the folder that gets
+    the digests, begins with file://.
     """
 
     name: str
     address: str
-    token: str = field(default="", repr=False)
-    key: Path | None = None  # the FILE.pub of whoever must have signed its digests
+    token: str = field(default="", repr=False)  # that the status page asks for
+    key: Path | None = None  # FILE.pub of the device that must have signed the digests
 
 
 def _shown(text: str) -> str:
-    """The beginning of a box's text, without half letters, which JSON but no file may hold."""
+    """The beginning of a box's text, with lone surrogates escaped: UTF-8 files can't have them."""
     return text[:_MAX_ALARM_CHARACTERS].encode(errors="backslashreplace").decode()
 
 
@@ -86,7 +87,7 @@ class BoxReading(BaseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class BoxState:
-    """How a box is: its last reading and when that was (UTC), and why there is none now."""
+    """The last reading of a box, its time (UTC), and the error of a failed attempt."""
 
     box: Box
     contact_ns: int | None = None  # None: never
@@ -124,11 +125,11 @@ class BoxState:
 
 
 def load_boxes(given: Sequence[str]) -> list[Box]:
-    """The boxes of addresses, and of files with one `NAME ADDRESS` or `ADDRESS` a line.
+    """The boxes of addresses, and of files with a line `NAME ADDRESS` or `ADDRESS` for each box.
 
-    An address is of a status page, with `?token=...` if it asks for one, a digest or a folder of
-    digests, which the device's FILE.pub may follow; # begins a comment. Raises ConfigError for
-    unusable files and addresses, and repeated addresses; UserError for keys.
+    An address is that of a status page, with `?token=...` if it asks for a token, or the path of a
+    digest or of a folder of digests, which the device's FILE.pub may follow. # begins a comment.
+    Raises ConfigError for unusable or repeated addresses and unusable files, UserError for keys.
     """
     boxes = list[Box]()
     for text in given:
@@ -168,7 +169,7 @@ def _box(text: str, *, where: str, name: str = "", key: str = "") -> Box:
     if _has_digests(text):
         path, signer = Path(text).resolve(), Path(key) if key else None
         if signer is not None:
-            load_public_key(signer)  # refused now, not when the first digest comes
+            load_public_key(signer)  # a bad key is refused now, not when the first digest comes
         return Box(name=name or path.name, address=path.as_uri(), key=signer)
     if key:
         raise ConfigError(
@@ -201,7 +202,7 @@ def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
     box, until_s = before.box, time.monotonic() + timeout_s
     try:
         if box.address.startswith("file:"):
-            return _told_by_digest(before)
+            return _state_by_digest(before)
         health = json.loads(_get(box, "health", until_s))
         reading = _reading(health, _values(_get(box, "metrics", until_s).decode()))
     except (KeyError, TypeError, ValueError, OverflowError, ValidationError, RecursionError):
@@ -215,8 +216,8 @@ def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
     return BoxState(box=box, contact_ns=before.contact_ns, reading=before.reading, error=error)
 
 
-def _told_by_digest(before: BoxState) -> BoxState:
-    """The state by the last digest; a box whose last digest is old is silent."""
+def _state_by_digest(before: BoxState) -> BoxState:
+    """The state by the last digest; if that is old, the box is silent."""
     path = Path(url2pathname(urlsplit(before.box.address).path))
     last = max(path.glob("digest-*.zip"), default=None) if path.is_dir() else path
     if last is None:
@@ -225,7 +226,7 @@ def _told_by_digest(before: BoxState) -> BoxState:
     if (digest := read_digest(last, key)) is None:
         return replace(before, error=f"{last.name} is not as it was signed, or not by its key")
     age = datetime.now(UTC).date() - date.fromisoformat(digest["day"])
-    is_old = not timedelta(0) <= age <= _MAX_DIGEST_AGE  # of a day to come: its clock is wrong
+    is_old = not timedelta(0) <= age <= _MAX_DIGEST_AGE  # below 0: the box's clock is wrong
     return BoxState(
         box=before.box,
         contact_ns=max(0, min(int(digest["made_ns"]), time.time_ns())),
@@ -249,7 +250,7 @@ def _get(box: Box, path: str, until_s: float) -> bytes:
     kind = HTTPSConnection if url.scheme == "https" else HTTPConnection
     with closing(kind(url.netloc, timeout=left_s)) as connection:
         connection.connect()
-        # The timeout is for a single byte; the timer ends an answer that drips.
+        # The timeout is for each read; the timer ends an answer that comes too slowly.
         timer = Timer(left_s, connection.sock.shutdown, (SHUT_RDWR,))
         timer.start()
         try:
@@ -308,9 +309,9 @@ class _Kept(BaseModel):
 
 
 def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
-    """The last contact of each box; none if there is no file yet.
+    """The last contact of each box; without a file, boxes without contact.
 
-    Raises OutputError for a file that is no such memory.
+    Raises OutputError if the file can't be read or has other content.
     """
     try:
         kept = _Kept.model_validate(json.loads(read_text(path, max_bytes=_MAX_BYTES))).boxes
@@ -340,13 +341,13 @@ def write_memory(path: Path, states: Iterable[BoxState]) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text in one step: readers get the old or the new text. Raises OutputError."""
+    """Replace a text file in one step: readers get the old or the new text. Raises OutputError."""
     with replacing(path) as draft:
         draft.write_text(text, encoding="utf-8", errors="backslashreplace")  # names of files
 
 
 def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:
-    """The HTML of the page; with `every_s` above 0 a browser loads it again as often."""
+    """The HTML of the page; if `every_s` is above 0, browsers reload it at that interval."""
     ordered = sorted(states, key=lambda state: (_ORDER.index(state.kind), state.box.name))
     return render(
         "watch/fleet.html",
@@ -359,7 +360,7 @@ def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns
 
 
 def fleet_summary(states: Sequence[BoxState]) -> str:
-    """One line: how many boxes are in which state, and their fish per hour together."""
+    """One line: the number of boxes in each state, and their fish per hour in total."""
     counts = Counter(state.kind for state in states)
     parts = [f"{counts[kind]} {words}" for kind, words in _SUMMARY.items() if counts[kind]]
     hourly = sum(s.reading.fish_per_hour for s in states if s.reading and not s.error)
@@ -368,5 +369,5 @@ def fleet_summary(states: Sequence[BoxState]) -> str:
 
 
 def minute_text(time_ns: int) -> str:
-    """A time for people, to the minute, UTC."""
+    """A time to the minute, UTC, for readers of the page."""
     return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M} UTC"

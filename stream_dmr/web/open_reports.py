@@ -1,4 +1,4 @@
-"""Opens the results of a run or a batch for a report, and writes its page."""
+"""Open the results of a run or a batch for a report, and write its page."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ def open_report(
 ) -> RunReport:
     """Read the report of a run's folder or of a recording; `as_measured`: without any review.
 
-    Raises a UserError if they can't be read, or if `source` is not the recorded one.
+    Raises UserError if they can't be read, or if `source` is not the recorded source.
     """
     recording = open_results(path)
     header = recording.header
@@ -112,9 +112,9 @@ def open_folders(
     config: Path | None = None,
     as_measured: bool = False,
 ) -> tuple[list[RunReport], list[str]]:
-    """A report of each run of several folders and batches, and a line for each video that failed.
+    """The reports of all runs of some folders and batches, and a line for each failed video.
 
-    Raises UserError, also if their fish don't fit into one page.
+    Raises UserError, also if their templates differ, since a page has a single template.
     """
     reports, failed = list[RunReport](), list[str]()
     for folder in folders:
@@ -148,7 +148,7 @@ def write_report(
     notes: Sequence[str] = (),
     coast: Sequence[Line] = (),
 ) -> int:
-    """Write the page and return its bytes; beside results, `verify` checks it as well.
+    """Write the page and return its size in bytes; `verify` checks it too if it is beside results.
 
     `coast` is drawn on the map.
     """

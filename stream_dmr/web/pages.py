@@ -1,4 +1,4 @@
-"""HTML from the templates of this folder; every value is escaped."""
+"""Make HTML from the templates of this folder; every value is escaped."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def render(template: str, **values: object) -> Markup:
 
 
 def _source(path: str) -> Markup:
-    """A script or a style sheet as it is."""
+    """A script or a style sheet, unchanged."""
     return Markup((_FOLDER / path).read_text(encoding="utf-8"))
 
 

@@ -1,4 +1,4 @@
-"""One self-contained HTML page about a run or a batch."""
+"""Make one self-contained HTML page about a run or a batch."""
 
 import math
 from base64 import b64encode
@@ -45,10 +45,10 @@ class RunReport:
     config: Config  # of the run
     settings: FisheriesSettings
     edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
-    source: str | None = None  # the place of the source by the user
-    efforts: Sequence[HaulEffort] = ()  # of its hauls; none for a recording without its database
-    track: VesselTrack | None = None  # None: likewise
-    watched_ns: Sequence[int] = ()  # capture times between which there were frames; none: likewise
+    source: str | None = None  # path or address of the source, if the user gave it
+    efforts: Sequence[HaulEffort] = ()  # of the hauls; empty for a recording without its database
+    track: VesselTrack | None = None
+    watched_ns: Sequence[int] = ()  # capture times of the first and last frames between pauses
     notes: Sequence[str] = ()  # for readers, about the run
 
     @property
@@ -57,7 +57,7 @@ class RunReport:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Capture times of the first and last frame, as far as they are known; else of the fish."""
+        """Capture times of the first and last frame; if unknown, of the fish alone."""
         estimates = [fish.estimate for fish in self.fish]
         firsts = [*self.watched_ns, *(estimate.first_timestamp_ns for estimate in estimates)]
         lasts = [*self.watched_ns, *(estimate.last_timestamp_ns for estimate in estimates)]
@@ -67,9 +67,9 @@ class RunReport:
 def trip_section(
     reports: Sequence[RunReport], *, coast: Sequence[Line] = (), is_folded: bool = False
 ) -> str:
-    """HTML: vessel and time, a row for each haul, and a map; "" if nothing of it is known.
+    """HTML of vessel and time, a row for each haul, and a map; "" if all of these are unknown.
 
-    `is_folded`: only the heading, until somebody opens it.
+    `is_folded`: shows the heading alone until a reader opens it.
     """
     fish = [caught for report in reports for caught in report.fish if caught.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
@@ -87,22 +87,22 @@ def _heading(fish: Sequence[Fish]) -> str:
         _named("trip", {caught.facts.trip for caught in fish}),
         _named("haul", {caught.haul for caught in fish}),
     ]
-    what = ", ".join(part for part in parts if part)
+    heading = ", ".join(part for part in parts if part)
     times = sorted(caught.utc_ns for caught in fish if caught.utc_ns is not None)
     if times:
         span = _span(*(utc_text(time_ns) or "" for time_ns in (times[0], times[-1])))
-        what += f"{': ' if what else ''}{span} UTC"
-    return what
+        heading += f"{': ' if heading else ''}{span} UTC"
+    return heading
 
 
-def _named(what: str, names: Iterable[str]) -> str:
+def _named(noun: str, names: Iterable[str]) -> str:
     known = sorted(name for name in names if name)
-    plural = "s" if what and len(known) > 1 else ""
-    return f"{what}{plural} {', '.join(known)}".strip() if known else ""
+    plural = "s" if noun and len(known) > 1 else ""
+    return f"{noun}{plural} {', '.join(known)}".strip() if known else ""
 
 
 def _span(*times: str) -> str:
-    """Times in ISO 8601 to the minute, for people; equal days are written once."""
+    """A span from two times in ISO 8601, to the minute; a date that both share stands once."""
     first, last = (time[:16].replace("T", " ") for time in times)
     if not (first and last):
         return first or last
@@ -110,7 +110,7 @@ def _span(*times: str) -> str:
 
 
 def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
-    """A row of the table for each haul: texts by the heads of their columns."""
+    """A row of the table for each haul: texts by column heading."""
     counted = [caught for caught in report.fish if caught.counts]
     zeros = {caught.facts.utc_zero_ns for caught in counted}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
@@ -149,7 +149,7 @@ def _counted(names: Iterable[str]) -> str:
 
 _SCRIPTS = ("table.js", "plots.js", "detail.js")
 _REVIEW_SCRIPTS = ("clip.js", "boxes.js", "points.js", "review.js", "keys.js")
-_MAX_TRACKS = 10**9  # of each run, in the numbers of a page of many runs
+_MAX_TRACKS = 10**9  # track ids of each run, for row numbers that differ between runs
 _MAX_COORDINATE = 32000  # the coordinates of a mesh are int16
 
 
@@ -163,8 +163,8 @@ def render_page(
 ) -> str:
     """The page of a report, or of all reports of a batch, which have the same template.
 
-    With a `review` it takes verdicts and sends them to its server; it has the `reviewer`, `blind`
-    and perhaps the `sample`.
+    With `review`, readers enter verdicts, and the page sends them to its server. `review` has the
+    keys `reviewer` and `blind`, and `sample` if a sample was drawn.
     """
     template = reports[0].recording.header.template
     placed = place(reports)
@@ -203,7 +203,7 @@ def render_page(
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
-    """How the stocks that a run learnt differ from their body forms."""
+    """A line for each stock that a run learnt, with its difference from its body form."""
     shapes = known_shapes(report.recording)
     stocks = None if shapes is None else shapes.stocks()
     if stocks is None:
@@ -222,14 +222,14 @@ class PlacedReport:
     report: RunReport
     run: int  # from 0
     is_one_of_many: bool
-    shift_s: float  # videos whose clocks start at zero follow each other in time
+    shift_s: float  # added to capture times, so that the times of videos don't overlap
 
     def row_id(self, track_id: int) -> int:
         """The number of a fish in the page."""
         return self.run * _MAX_TRACKS + track_id
 
     def row(self, fish: Fish) -> dict[str, Any]:
-        """The row of a fish in the table of the page; `id` is its number in the page."""
+        """The row of a fish in the page's table; `id` is its number in the page."""
         row = summary_row(fish, self.report)
         if not self.is_one_of_many:
             return row
@@ -253,7 +253,7 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
-    """The row of a fish in the table: its row of fish.csv, and its best view, small."""
+    """The row of a fish in the table: its row of fish.csv, and a thumbnail of its best view."""
     record = fish_record(fish, report.recording.header.template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
@@ -275,7 +275,7 @@ def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
 
 
 def _moved_points(fish: Fish, views: Sequence[DrawnView]) -> dict[int, Any]:
-    """Frame index -> the head and tail points that a reviewer has set, in pixels of the crop."""
+    """Head and tail points that a reviewer set, by frame index, in pixels of the crop."""
     by_frame = {view.recorded.row.fish.frame_index: view for view in views}
     return {
         frame_index: np.round(
@@ -301,7 +301,7 @@ def fish_detail(fish: Fish, report: RunReport) -> dict[str, Any]:
 
 
 def _frame_values(row: FishFrame) -> list[Any]:
-    """Frame, time, length, std, used, reason, IoU, running length, its low and high end."""
+    """Frame, time (s), length, std, used, reason, IoU, running length, its interval's two ends."""
     fish, estimate = row.fish, row.estimate
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
     numbers = (fish.length_mm, fish.length_std_mm)

@@ -1,4 +1,4 @@
-"""The server of `review`, and the order in which it offers fish."""
+"""Serve `review`: its page, clips and verdicts."""
 
 import secrets
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from stream_dmr.web.verdict_recorder import VerdictRecorder, parse_verdict
 
 @dataclass(frozen=True, kw_only=True)
 class AuditSample:
-    """How many fish are drawn at random, and from which seed."""
+    """A random sample of fish: its size, and the seed of the generator."""
 
     size: int
     seed: int = 0
@@ -63,7 +63,7 @@ class ReviewQueue:
         return render_page(reports, title=title, review=self._about | {"undo": self._undo()[1]})
 
     def reviewed_rows(self) -> list[dict[str, Any]]:
-        """The rows of all fish that any verdict was about, or `{"id": ..., "gone": true}`."""
+        """The rows of all fish that a verdict names; `{"id": ..., "gone": true}` for lost fish."""
         rows: list[dict[str, Any]] = []
         for run, recorder in enumerate(self._recorders):
             _, _, named = recorder.said()
@@ -71,10 +71,10 @@ class ReviewQueue:
         return rows
 
     def record(self, content: bytes) -> dict[str, Any]:
-        """Take a verdict in JSON. UserError if it is none.
+        """Take a verdict in JSON. Raises UserError if it is invalid.
 
-        Returns the `rows` of the fish that it changes, the verdict in words (`said`), and the
-        verdict that an `undo` takes back next, the reviewer's last verdict in any run.
+        Returns `rows` of the changed fish, the verdict in words (`said`), and in `undo` the verdict
+        that an undo would take back: this reviewer's last verdict in any run.
         """
         submitted = parse_verdict(content)
         is_undo = submitted.kind == "undo"
@@ -82,8 +82,8 @@ class ReviewQueue:
         recorder = self._recorder(run)
         rows = self._rows(run, recorder.record(submitted))
         self._last[run] = recorder.last()
-        said = f"{undone}, taken back" if is_undo else self._in_words(run)
-        return {"rows": rows, "said": said, "undo": self._undo()[1]}
+        in_words = f"{undone}, taken back" if is_undo else self._in_words(run)
+        return {"rows": rows, "said": in_words, "undo": self._undo()[1]}
 
     def detail(self, run: int, track_id: int) -> dict[str, Any]:
         """The details that a row opens. UserError without such a fish."""
@@ -144,7 +144,7 @@ class ReviewQueue:
 def species_choices(own_list: str) -> list[dict[str, str]]:
     """Codes and names that a reviewer may type, and the `value` that becomes the verdict.
 
-    A species of the user's own list is given by its code, which every reader of the verdict knows.
+    The value of a species in the user's own list is its code: readers need not have the list.
     """
     bundled = {species.code for species in load_species()}
     try:

@@ -1,4 +1,4 @@
-"""The state of a run that its status page and its Prometheus metrics show."""
+"""Keep the state of a run for its status page and its Prometheus metrics."""
 
 import shutil
 import threading
@@ -25,12 +25,12 @@ from stream_dmr.sources.source import Source
 from stream_dmr.store.length_store import LengthStore
 
 _MAX_FRAMES = 16  # more than the chain's queues hold, so that a fish finds its frame
-_MAX_FISH = 4 * _MAX_FRAMES  # in these frames
+_MAX_FISH = 4 * _MAX_FRAMES  # kept fish of these frames
 MAX_FINISHED = 20  # in the page's table
 _MAX_WARNINGS = 50
 _MAX_FITS = 1000  # for quantiles of their time
 _HOUR_S = 3600.0
-_MIN_RATE_WINDOW_S = 60.0  # else a fish in the first second would be thousands an hour
+_MIN_RATE_WINDOW_S = 60.0  # else a fish in the first second would count as thousands an hour
 _RATE_WINDOW_S = 10.0
 _MAX_RATE_FRAMES = 300  # in this window
 _MAX_HOURLY_FISH = 10_000
@@ -38,7 +38,7 @@ _MAX_HOURLY_FISH = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class RepeatedWarning:
-    """A warning, how often it came, and when last (monotonic clock)."""
+    """A warning with its count and the last time it came (monotonic clock)."""
 
     line: str
     count: int
@@ -71,10 +71,10 @@ class RunState:
         scale_alarm: Callable[[], str] = str,
         store: LengthStore | None = None,
     ) -> None:
-        """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems.
+        """Problems are a camera silent for `silence_s`, and a frame in work for `stuck_s`.
 
-        So are a line of `scale_alarm` (a known length was measured wrong), and a `store` whose file
-        or folder was moved, also while no frame comes.
+        Further problems are the line of `scale_alarm`, after a wrong measurement of a known length,
+        and a `store` whose file or folder was moved, also while no frames come.
         """
         self.source = source
         self.positions, self.hauls = positions, hauls
@@ -101,7 +101,7 @@ class RunState:
         self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
 
     def continue_after(self, store: LengthStore) -> None:
-        """Begin with the fish of earlier runs in the folder: their numbers, and the last fish."""
+        """Begin with the fish of earlier runs in the folder: their counts, and the last fish."""
         for status, number in store.counts("status").items():
             self.num_fish[without_counts(status)] += number
         self.species.update(store.counts("species_code"))
@@ -109,7 +109,7 @@ class RunState:
         self.finished.extend(store.estimates())
 
     def take(self, message: Message) -> None:
-        """Keep the parts of a message that the page shows; no picture is copied."""
+        """Keep the parts of a message that the page shows; pictures are not copied."""
         with self._lock:
             match message:
                 case Frame():
@@ -145,7 +145,7 @@ class RunState:
             return list(self._warnings.values())[::-1]
 
     def latest_frame(self) -> MeasuredFrame | None:
-        """The latest frame with localized fish; the latest frame of all if there are no fish."""
+        """The latest frame with localized fish; without fish, the latest frame."""
         with self._lock:
             if not self._frames:
                 return None
@@ -157,14 +157,14 @@ class RunState:
             return MeasuredFrame(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
 
     def frames_per_s(self) -> float:
-        """Frames that left the chain, over the last ten seconds."""
+        """Frames per second that left the chain, over the last ten seconds."""
         with self._lock:
             now_s = time.monotonic()
             recent = sum(now_s - done_s <= _RATE_WINDOW_S for done_s in self._frames_done_s)
         return recent / max(min(_RATE_WINDOW_S, now_s - self._began_s), 1e-3)
 
     def fish_per_hour(self) -> float:
-        """Fish that were finished, over the last hour or since the start."""
+        """Finished fish per hour, over the last hour or since the start."""
         with self._lock:
             now_s = time.monotonic()
             recent = sum(now_s - done_s <= _HOUR_S for done_s in self._fish_done_s)
@@ -172,27 +172,27 @@ class RunState:
         return recent * _HOUR_S / window_s
 
     def fit_quantiles(self) -> dict[float, float]:
-        """Quantile -> seconds that a fit took, of the last thousand; empty without any."""
+        """Times of the last thousand fits, s, by quantile; empty without fits."""
         with self._lock:
             fit_s = list(self.fit_s)
         return {q: float(np.quantile(fit_s, q)) for q in (0.5, 0.9, 0.99)} if fit_s else {}
 
     def last_frame_age_s(self) -> float | None:
-        """Time since the last frame came from the camera; None if the source is no camera."""
+        """Seconds since the camera's last frame came; None if the source is no camera."""
         counts = self.source.counts
         if counts is None:
             return None
         return (time.monotonic_ns() - counts.last_arrival_ns) / 1e9
 
     def disk_free_bytes(self) -> int:
-        """Free space in the folder of results; 0 if that folder is away."""
+        """Free space in the folder of results; 0 if the folder is missing."""
         try:
             return shutil.disk_usage(self._out_dir).free
         except OSError:
             return 0
 
     def problems(self) -> list[str]:
-        """Why this run is not healthy, for people; empty when it is."""
+        """The reasons why this run is unhealthy, for people; empty if it is healthy."""
         problems: list[str] = []
         age_s = self.last_frame_age_s()
         if age_s is not None and age_s > self._silence_s:
@@ -208,7 +208,7 @@ class RunState:
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:
-        """True if a stage has had the same frame for longer than any fit takes."""
+        """True if a stage has worked on the same frame for more than `stuck_s`."""
         return self.chain is not None and self.chain.longest_busy_s() > self._stuck_s
 
     def _finish(self, estimate: LengthEstimate) -> None:
@@ -221,7 +221,7 @@ class RunState:
 
 
 class RunMetrics(Collector):
-    """Collects a run's metrics. Of each stage, in = processed + dropped + failed + in work."""
+    """Collects a run's metrics. For each stage, in = processed + dropped + failed + in work."""
 
     def __init__(self, state: RunState) -> None:
         self._state = state

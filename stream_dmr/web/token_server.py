@@ -1,7 +1,7 @@
 """Serve HTTP to people with a token, given by ?token=, a cookie or an Authorization header.
 
-Clients are bounded: in connections, in the time that a request may take to arrive, and in the time
-that its answer may take to be read. A page of another site can't read along: the names Host and
+Three things are limited: the number of connections, the time until a request has arrived, and the
+time until its answer is read. Pages of other sites can't read the answers: the headers Host and
 Origin of a request are checked.
 """
 
@@ -41,7 +41,7 @@ class Request:
     body: bytes  # of a POST
 
     def number(self, name: str) -> int:
-        """A number in the address, 0 without it. Raises UserError for another value."""
+        """A number in the address; 0 if it is missing. Raises UserError if it is no integer."""
         try:
             return int(self.query.get(name, ["0"])[0])
         except ValueError:
@@ -50,7 +50,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Response:
-    """An answer; an answer in parts ends with its connection."""
+    """An answer; if it comes in parts, the end of the connection ends it."""
 
     content: bytes | Iterator[bytes]
     media_type: str = "text/html; charset=utf-8"
@@ -69,21 +69,21 @@ Route = Callable[[Request], Response]  # raises UserError for a request that it 
 
 
 class TokenServer(ThreadingHTTPServer):
-    """Serves a table of routes from threads of its own until `close`; token "": to everybody.
+    """Serves a table of routes in threads until `close`; with the token "" to everybody.
 
-    A POST must bring JSON: a form of another site can't send that with the cookie.
+    A POST must be JSON: a form of another site can't send that with the cookie.
     """
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 64  # in the kernel: a burst does not have to wait a second for a retry
+    request_queue_size = 64  # in the kernel: clients of a burst need not retry after a second
     # Chosen: some phones and Prometheus need a handful of connections, for a second at most.
     max_connections = 32
     request_timeout_s = 5.0  # until the headers are there
     answer_timeout_s = 30.0  # from there on
-    closing_timeout_s = 1.0  # for the thread of a connection that makes room to close it
+    closing_timeout_s = 1.0  # until a connection that makes room is closed by its thread
     max_body_bytes = 1 << 16
-    setting = "host or port"  # to name in an error, if the address can't be had
+    setting = "host or port"  # named in the error if the address is not available
 
     def __init__(
         self,
@@ -92,11 +92,11 @@ class TokenServer(ThreadingHTTPServer):
         *,
         token: str,
     ) -> None:
-        """Raises OutputError if it can't have the address."""
+        """Raises OutputError if the address is not available."""
         self.routes, self.token = routes, token
         self._closed = threading.Condition()  # notified of each closed connection
         self._connections = set[socket.socket]()
-        self._strangers: dict[socket.socket, bool] = {}  # whether local; in their order
+        self._strangers: dict[socket.socket, bool] = {}  # True if local; the oldest first
         try:
             super().__init__(address, _Handler)
         except OSError as error:
@@ -107,10 +107,10 @@ class TokenServer(ThreadingHTTPServer):
             ) from error
         host = str(self.server_address[0])
         self.is_local = is_loopback(host)
-        if ip_address(host).is_unspecified:  # it listens on all; nobody can open that
+        if ip_address(host).is_unspecified:  # it listens on all addresses; browsers need a name
             host = socket.gethostname()
         self.address = f"http://{host}:{self.server_port}/"
-        # Looks every 0.1 s whether it shall end.
+        # Checks every 0.1 s if it shall end.
         self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
 
@@ -122,8 +122,8 @@ class TokenServer(ThreadingHTTPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a connection in a thread of its own.
 
-        If there are too many, the oldest that has sent no request with the token makes room, first
-        those of other machines; if all have sent one, the new connection is closed.
+        If there are too many connections, the oldest that has not sent the token is closed, first
+        those of other machines. If all have sent the token, the new connection is closed.
         """
         with self._closed:
             is_busy = not self._has_room() and not self._make_room()
@@ -147,7 +147,7 @@ class TokenServer(ThreadingHTTPServer):
             self._forget(request)
 
     def admit(self, request: socket.socket) -> None:
-        """Keep a connection for good: it has sent a request with the token."""
+        """Keep a connection that has sent a request with the token."""
         with self._closed:
             self._strangers.pop(request, None)
 
@@ -155,7 +155,7 @@ class TokenServer(ThreadingHTTPServer):
         return len(self._connections) < self.max_connections
 
     def _make_room(self) -> bool:
-        """End the oldest stranger's connection, and wait until its descriptor is free."""
+        """End the oldest connection without a token, and wait until its descriptor is free."""
         oldest = min(self._strangers, key=self._strangers.__getitem__, default=None)
         if oldest is None:
             return False
@@ -171,7 +171,7 @@ class TokenServer(ThreadingHTTPServer):
             self._closed.notify()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print a traceback, but not for a reader who left."""
+        """Print a traceback, but not if the reader closed the connection."""
         if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
 
@@ -184,12 +184,12 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def setup(self) -> None:
-        """Begin to wait for the request."""
+        """Limit the time until the headers have arrived."""
         super().setup()
         self._timer = self._start_timer(self.server.request_timeout_s)
 
     def parse_request(self) -> bool:
-        """Read the headers; from there on the answer has its own time."""
+        """Read the headers; from then on the answer has its own time limit."""
         is_valid = super().parse_request()
         self._timer.cancel()
         self._timer = self._start_timer(self.server.answer_timeout_s)
@@ -206,7 +206,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_POST = do_GET
 
     def _response(self) -> Response | None:
-        """The answer; None if there was one already."""
+        """The answer; None if it was already sent."""
         try:
             url = urlsplit(self.path)
         except ValueError:  # such as http://[::1
@@ -252,14 +252,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _end_connection(self) -> None:
         with suppress(OSError):
-            self.connection.shutdown(socket.SHUT_RDWR)  # ends threads that wait for it
+            self.connection.shutdown(socket.SHUT_RDWR)  # wakes threads that wait for it
 
     def _is_own_page(self) -> bool:
-        """True unless a browser was led here by a page of another site.
+        """True unless a page of another site made the browser send this request.
 
-        DNS rebinding: a page's own name, resolved to an address of this machine, lets that page
-        read answers without a token. So a server for this machine alone answers to the names of
-        this machine alone. `Origin`, if a browser sends it, is the origin of the page.
+        DNS rebinding: if a page's own name resolves to an address of this machine, that page can
+        read answers without a token. So a server for this machine alone accepts only names of this
+        machine. `Origin`, if the browser sends it, is the origin of the page.
         """
         host, origin = self.headers.get("Host"), self.headers.get("Origin")
         if host is not None and self.server.is_local:
@@ -277,7 +277,7 @@ class _Handler(BaseHTTPRequestHandler):
         return f"stream_dmr_{self.server.server_port}"
 
     def _set_cookie(self, path: str) -> None:
-        """Keep the token as a cookie, so that it is in no address that is shown or logged."""
+        """Keep the token as a cookie, so that no shown or logged address contains it."""
         self.send_response(HTTPStatus.SEE_OTHER)
         cookie = f"{self._cookie_name}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
         self.send_header("Set-Cookie", cookie)
@@ -302,7 +302,7 @@ class _Handler(BaseHTTPRequestHandler):
         return hmac.compare_digest(token.encode(), self.server.token.encode())
 
     def _answer(self, response: Response) -> None:
-        """Send it; no browser caches it, guesses its type or shows it in a frame."""
+        """Send an answer that browsers neither cache, nor guess its type, nor show in a frame."""
         content = response.content
         self.send_response(response.code)
         self.send_header("Content-Type", response.media_type)

@@ -1,4 +1,4 @@
-"""The map of a trip: track, hauls, fish, coastline."""
+"""Draw the map of a trip: track, hauls, fish and coastline."""
 
 import json
 import math
@@ -14,13 +14,13 @@ from stream_dmr.web.pages import render
 
 Line = Sequence[tuple[float, float]]  # longitude and latitude of each point, degrees
 
-_MAX_BYTES = 100_000_000  # Natural Earth's finest has a fifth of it
-# How deep the lists of coordinates are nested above a line, by type of geometry (RFC 7946, 3.1).
+_MAX_BYTES = 100_000_000  # Natural Earth's finest coastline has a fifth of it
+# Levels of nested lists above the coordinates of a line, by type of geometry (RFC 7946, 3.1).
 _DEPTHS = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 
 
 def load_coast(path: Path) -> list[Line]:
-    """The lines of a file, and the edges of its areas. Raises UserError if it has none."""
+    """The lines and the edges of the areas in a GeoJSON file. Raises UserError without any."""
     try:
         lines = list(_lines(json.loads(read_text(path, max_bytes=_MAX_BYTES))))
     except (OSError, UnicodeDecodeError) as error:
@@ -55,7 +55,7 @@ def _lines(element: Any) -> Iterator[Line]:
 
 _WIDTH, _HEIGHT, _MARGIN = 720.0, 360.0, 34.0
 _M_PER_DEGREE = 111_195.0  # of latitude, on a sphere of the earth's mean radius
-_MIN_SPAN_M = 200.0  # of the map: less would show the receiver's noise
+_MIN_SPAN_M = 200.0  # of the map: a smaller map would show the receiver's noise
 _MAX_POINTS = 3000  # of the track
 _COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
 
@@ -63,7 +63,7 @@ _COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
 def draw_map(
     tracks: Sequence[VesselTrack], fish: Sequence[Fish], coast: Sequence[Line] = ()
 ) -> str:
-    """A figure of SVG with its key; "" without a position. Fish have a colour for each haul."""
+    """An SVG figure with its key; "" without positions. Each haul's fish have their own colour."""
     pieces = [
         [(kept.longitude, kept.latitude) for kept in piece]
         for track in tracks
@@ -100,7 +100,7 @@ def _dot(fish: Fish, view: "_View", colour: str) -> dict[str, object] | None:
 
 
 class _View:
-    """Longitude and latitude to points of the picture: equirectangular, true at its middle."""
+    """Equirectangular map from longitude and latitude to pixels, true to scale at its middle."""
 
     def __init__(self, places: Sequence[tuple[float, float]]) -> None:
         self._origin = places[0][0]
@@ -113,7 +113,7 @@ class _View:
         self.px_per_m = min((_WIDTH - 2 * _MARGIN) / wide_m, (_HEIGHT - 2 * _MARGIN) / high_m)
 
     def _unwrapped(self, longitude: float) -> float:
-        """The longitude near the first point's, so that no track is torn at 180 degrees."""
+        """The longitude within 180 degrees of the first point's, so no track breaks at +-180."""
         return self._origin + (longitude - self._origin + 180) % 360 - 180
 
     def points(self, line: Line) -> str:
@@ -121,7 +121,7 @@ class _View:
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in map(self.xy, line))
 
     def pieces(self, line: Line) -> Iterator[str]:
-        """The points of each part of a line that comes into the picture, or near it."""
+        """The SVG points of each part of a line in or near the picture."""
         points, near = [self.xy(place) for place in line], list[int]()
         for k in range(1, len(points) + 1):
             if k < len(points) and self._is_near(points[k - 1], points[k]):
@@ -131,7 +131,10 @@ class _View:
                 near.clear()
 
     def _is_near(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
-        """True if the box around two points meets the picture; False across the other side."""
+        """True if the box around two points meets the picture.
+
+        False if they are more than 180 degrees apart: there the unwrapped longitude jumps.
+        """
         half_px = 180 * self._squeeze * _M_PER_DEGREE * self.px_per_m
         return (
             abs(b[0] - a[0]) <= half_px
@@ -157,7 +160,7 @@ class _View:
         return {"x0": x1 - metres * self.px_per_m, "x1": x1, "y": _HEIGHT - 12.0, "text": text}
 
     def middle(self) -> str:
-        """The place of the middle, and the direction of north, in words."""
+        """Text: position of the map's middle, and the direction of north."""
         longitude, latitude = self._middle
         longitude = (longitude + 180) % 360 - 180
         ns, ew = "NS"[latitude < 0], "EW"[longitude < 0]

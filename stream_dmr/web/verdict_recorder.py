@@ -56,12 +56,12 @@ class DrawnBox(BaseModel):
 
 
 class SubmittedVerdict(BaseModel):
-    """A verdict; head and tail are in pixels of the frame's crop."""
+    """A verdict as the page sends it; head and tail are in pixels of the frame's crop."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    run: int = 0  # of the page, from 0
-    track_id: int = 0  # of an `add`: none
+    run: int = 0  # number of the run in the page, from 0
+    track_id: int = 0  # an `add` has none yet
     kind: str = Field(max_length=20)
     reason: str = Field(default="", max_length=500)
     species: str = Field(default="", max_length=200)
@@ -73,11 +73,11 @@ class SubmittedVerdict(BaseModel):
     tail: Point | None = None
     other_fish: int | None = None
     boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=10_000)
-    sure: bool = False  # do it although it contradicts measurements
+    sure: bool = False  # True: write it although it contradicts measurements
 
 
 def parse_verdict(content: bytes) -> SubmittedVerdict:
-    """The verdict in JSON. Raises UserError if it is none."""
+    """Read a verdict in JSON. Raises UserError if it is invalid."""
     try:
         return SubmittedVerdict.model_validate_json(content)
     except ValidationError as error:
@@ -89,7 +89,7 @@ def drawn_boxes(
 ) -> tuple[dict[int, Float[np.ndarray, "4"]], tuple[int, int]]:
     """The boxes by frame, and the capture times of the first and the last frame, ns.
 
-    Raises UserError without boxes, and for an empty box.
+    Raises UserError if there are no boxes, or a box is less than a pixel wide or high.
     """
     if not boxes:
         raise UserError("verdict: expected a box around the fish; draw one on a frame of the clip")
@@ -102,7 +102,7 @@ def drawn_boxes(
 
 
 def require_database(report: RunReport) -> Path:
-    """The database that takes the verdicts; UserError without one."""
+    """The lengths.db that takes the verdicts. Raises UserError if there is none."""
     database = database_of(report.path)
     if database is None:
         raise UserError(
@@ -113,12 +113,12 @@ def require_database(report: RunReport) -> Path:
 
 
 class VerdictRecorder:
-    """Verdicts of a reviewer on the fish of a run. Thread-safe."""
+    """Takes the verdicts of a reviewer on the fish of a run. Thread-safe."""
 
     def __init__(self, report: RunReport, reviewer: str, *, blind: bool = False) -> None:
-        """UserError without a database to write to.
+        """Raises UserError without a database to write to.
 
-        A `blind` reading sees the fish as they were measured, and changes no review.
+        With `blind`, the reader sees the fish as they were measured, and changes no review.
         """
         self._database = require_database(report)
         self.report = report
@@ -131,38 +131,39 @@ class VerdictRecorder:
         self._lock = Lock()
 
     def record(self, submitted: SubmittedVerdict) -> list[int]:
-        """Check and write a verdict; returns the fish that it changes.
+        """Check and write a verdict; returns the track ids of the changed fish.
 
-        UserError if it contradicts itself or known facts; DoubtError if it may be right.
+        Raises UserError if the verdict contradicts itself or known facts, and DoubtError if it
+        contradicts measurements but may be right.
         """
         with self._lock:
-            said = read_verdicts(self._database)
-            self._follow(said)
+            earlier = read_verdicts(self._database)
+            self._follow(earlier)
             verdict = self._verdict(submitted)
             if verdict.kind == "undo":
-                edit = TrackEdit(verdict=self._undo(verdict, said))
+                edit = TrackEdit(verdict=self._undo(verdict, earlier))
             else:
-                edit = self._checked(verdict, submitted, said)
+                edit = self._checked(verdict, submitted, earlier)
             is_edit, before = verdict.kind in (*EDITS, "undo"), self.report.edits
             add_verdict(
                 self._database,
                 edit.verdict,
                 frames=edit.frames,
                 new_fish=edit.new_fish,
-                known=len(said) if is_edit else None,
+                known=len(earlier) if is_edit else None,
             )
             seal_verdicts(self._database.parent)
             self._follow(read_verdicts(self._database))
             return sorted({edit.verdict.track_id} | changed_fish(before, self.report.edits))
 
     def last(self) -> Verdict | None:
-        """The verdict that an undo would take back."""
-        said = read_verdicts(self._database)
-        number = last_of(said, self._reviewer, self._reading)
-        return None if number is None else said[number - 1]
+        """The verdict that an undo would take back; None if there is none."""
+        verdicts = read_verdicts(self._database)
+        number = last_of(verdicts, self._reviewer, self._reading)
+        return None if number is None else verdicts[number - 1]
 
     def said(self) -> tuple[RunReport, dict[int, Review], set[int]]:
-        """The fish as they are now, their reviews, and all fish that a verdict ever spoke of."""
+        """The present fish, their reviews, and the ids of all fish that any verdict names."""
         with self._lock:
             verdicts = read_verdicts(self._database)
             self._follow(verdicts)
@@ -176,7 +177,7 @@ class VerdictRecorder:
         return reviews_of(blind_readings(verdicts).get(self._reviewer, []))
 
     def _follow(self, verdicts: Sequence[Verdict]) -> None:
-        """Apply all edits of any reviewer: added, split, merged and undone."""
+        """Update the report by the edits of all reviewers; a blind reading applies none."""
         if self._reading is not None:
             return
         changed = changed_fish(self.report.edits, edits_of(verdicts))
@@ -200,7 +201,7 @@ class VerdictRecorder:
         )
 
     def _checked(
-        self, verdict: Verdict, submitted: SubmittedVerdict, said: Sequence[Verdict]
+        self, verdict: Verdict, submitted: SubmittedVerdict, earlier: Sequence[Verdict]
     ) -> TrackEdit:
         report = self.report
         if verdict.kind in EDITS and self._reading is not None:
@@ -208,7 +209,7 @@ class VerdictRecorder:
                 "verdict: expected accept, reject, duplicate, species or moved points: a blind "
                 "reading is of the fish as they were measured"
             )
-        reviews = self._reviews(said)
+        reviews = self._reviews(earlier)
         measured = {
             fish.estimate.track_id: fish.estimate
             for fish in report.fish
@@ -237,15 +238,15 @@ class VerdictRecorder:
             case _:
                 return TrackEdit(verdict=verdict)
 
-    def _undo(self, verdict: Verdict, said: Sequence[Verdict]) -> Verdict:
-        """Take back the last verdict of this reviewer. UserError if others build on it."""
-        number = last_of(said, self._reviewer, self._reading)
+    def _undo(self, verdict: Verdict, earlier: Sequence[Verdict]) -> Verdict:
+        """Take back this reviewer's last verdict. UserError if later verdicts depend on it."""
+        number = last_of(earlier, self._reviewer, self._reading)
         if number is None:
             raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
-        undone = said[number - 1]
+        undone = earlier[number - 1]
         if undone.kind in EDITS:
-            fish, counted = {undone.track_id, undone.other_fish} - {None}, standing(said)
-            for later in said[number:]:
+            fish, counted = {undone.track_id, undone.other_fish} - {None}, standing(earlier)
+            for later in earlier[number:]:
                 if later in counted and fish & {
                     later.track_id,
                     later.other_fish,
@@ -260,7 +261,7 @@ class VerdictRecorder:
     def _corrected(
         self, verdict: Verdict, submitted: SubmittedVerdict, moved: Mapping[int, Ends]
     ) -> Verdict:
-        """The verdict with its points in frame pixels and the length that follows."""
+        """The verdict with its points in frame pixels and the length from them."""
         if submitted.frame_index is None or submitted.head is None or submitted.tail is None:
             raise UserError("verdict: expected a frame with its head and tail points")
         crop = decode(FishCrop, self._view(submitted.track_id, submitted.frame_index).crop)
@@ -299,7 +300,7 @@ class VerdictRecorder:
 
 
 def _require_unmoved(reviews: Mapping[int, Review], *fish: int | None) -> None:
-    """Points that were moved are of a fish as it was: UserError before it gets other frames."""
+    """Raise UserError if a fish has moved points: they hold only for its present frames."""
     for number in fish:
         if number is not None and reviews.get(number, NOT_REVIEWED).moved:
             raise UserError(

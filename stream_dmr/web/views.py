@@ -1,4 +1,4 @@
-"""Pictures of recorded fish with mask, mesh and keypoints."""
+"""Draw pictures of recorded fish with mask, mesh and keypoints."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ from stream_dmr.store.edits import ReviewedMessages
 
 _MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
 _KEYPOINTS_BGR = (60, 60, 255), (255, 255, 255), (255, 160, 60)  # head, center, tail
-_OVERSAMPLING = 2  # of the crop's pixels, for the outline of a mesh
+_OVERSAMPLING = 2  # pixels per crop pixel, along each axis, for the outline of a mesh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,10 +108,10 @@ def draw_outlines(
 def frame_images(
     recording: Recording, wanted: set[int], source: str | None, *, is_given: bool
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """The images of the wanted frames, from `source`, or from the recording if it has any.
+    """The images of the wanted frames, from `source`, or without it from the recording.
 
-    A source other than the recorded one raises SourceError if it `is_given` by the user; else its
-    frames are left out.
+    If `source` is not the recorded source, SourceError is raised if the user gave it (`is_given`);
+    else its frames are left out.
     """
     checked = nullcontext() if is_given else suppress(SourceError)
     if source is None:
@@ -139,7 +139,7 @@ _Key = tuple[int, int]  # frame index, track id
 
 @dataclass(frozen=True, kw_only=True)
 class FishFrame:
-    """A fish in a frame: its length by that frame, and the running estimate after it."""
+    """A fish in a frame: its length in that frame, and the running estimate after it."""
 
     fish: LocalizedFish
     estimate: LengthEstimate
@@ -147,7 +147,7 @@ class FishFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedView:
-    """A fish in a frame with its crop and fit, encoded: a season of masks fits into memory."""
+    """A fish in a frame with crop and fit, encoded so that a season of masks fits into memory."""
 
     crop: bytes
     fit: bytes
@@ -156,14 +156,14 @@ class RecordedView:
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
-        """The key for sorting; the best view is the largest.
+        """The sort key: the best view has the largest.
 
-        Used frames come first, then frames with a picture in the recording, then by their IoU.
+        Views are compared by their use for the length, then a recorded picture, then the IoU.
         """
         return self.row.estimate.is_frame_used, self.has_picture, self.row.fish.iou or 0.0
 
     def decode(self, meshes: MeshRebuilder) -> tuple[FishCrop, FittedMesh]:
-        """Crop and fit, the fit with its vertices."""
+        """The crop, and the fit with its vertices."""
         return decode(FishCrop, self.crop), meshes.with_vertices(decode(FittedMesh, self.fit))
 
 
@@ -186,7 +186,7 @@ class RecordedTrack:
 def read_tracks(reviewed: ReviewedMessages, *, max_views: int = 3) -> dict[int, RecordedTrack]:
     """Every fish with its `max_views` best views. Raises RecordingError.
 
-    Fish that reviewers made have the running estimates of their frames.
+    For fish that reviewers made, the running estimates are computed from their frames.
     """
     tracks, edited = dict[int, RecordedTrack](), reviewed.estimates()
     crops, fits = dict[_Key, tuple[bytes, bool]](), dict[_Key, bytes]()
@@ -247,10 +247,9 @@ def draw_views(
 ) -> DrawnViews:
     """Draw the views of all tracks, with the pictures of `source` or of the recording.
 
-    Without `source`, the recorded source is tried. With `pictures`, which find a frame without
-    reading all before it, nothing else is read; so a recorded video is searched. Fish without a
-    picture are drawn by their masks. Raises SourceError if a given `source` is not the recorded
-    one.
+    Without `source`, the recorded source is tried. `pictures` replaces both: it finds a frame
+    without reading all frames before it, as is done for a recorded video. Fish without a picture
+    are drawn as their masks. Raises SourceError if a given `source` is not the recorded source.
     """
     path = recorded_source(recording) if pictures is None and source is None else None
     if path is not None and Path(path).is_file():
@@ -263,18 +262,18 @@ def draw_views(
             waiting[view.row.fish.frame_index].append((track_id, view))
     drawn_views: defaultdict[int, list[DrawnView]] = defaultdict(list)
     if pictures is None:
-        of = source or recorded_source(recording)
-        images = frame_images(recording, set(waiting), of, is_given=source is not None)
+        video = source or recorded_source(recording)
+        images = frame_images(recording, set(waiting), video, is_given=source is not None)
     else:
         times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
         found = (shown.frame for t in sorted(times) for shown in pictures.frames((t, t + 1)))
         images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
     without = ((frame_index, None) for frame_index in list(waiting))
-    for frame_index, image in chain(images, without):  # the first that has a frame draws it
+    for frame_index, image in chain(images, without):  # the first image of a frame is drawn
         for track_id, view in waiting.pop(frame_index, []):
             drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
-    for of_track in drawn_views.values():
-        of_track.sort(key=lambda view: view.recorded.rank, reverse=True)
+    for views in drawn_views.values():
+        views.sort(key=lambda view: view.recorded.rank, reverse=True)
     return drawn_views
 
 

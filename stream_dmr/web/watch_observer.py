@@ -1,7 +1,7 @@
 """Observe a run for its status page, its log in JSON and systemd.
 
-Systemd learns by the protocol of sd_notify(3) that the service is ready and alive: a line to the
-datagram socket that NOTIFY_SOCKET names.
+Systemd is notified that the service is ready and alive by sd_notify(3): a line to the datagram
+socket named by NOTIFY_SOCKET.
 """
 
 import json
@@ -28,16 +28,16 @@ from stream_dmr.web.run_state import RunState
 from stream_dmr.web.watch_page import WatchServer
 
 _REPEAT_INTERVAL_S = 60.0
-_MAX_KINDS = 200  # of lines that are remembered; beyond it, the longest silent kind is dropped
+_MAX_KINDS = 200  # of remembered lines; above it, the kind that was silent longest is dropped
 _PROGRESS_INTERVAL_S = 60.0
-_Kind = tuple[object, ...]  # event, text and fish, by which lines are equal
+_Kind = tuple[object, ...]  # event, text and fish; lines of the same kind are repetitions
 _FISH_FACTS = ("track_id", "length_mm", "length_std_mm", "frames_used", "frames_seen", "status")
 
 
 class JsonLog(RunObserver):
-    """Logs the events of a run as JSON on stderr, for a service's log; equal events once a minute.
+    """Logs the events of a run as JSON on stderr, for a service's log.
 
-    The next line counts the events held back.
+    Repeated events are logged once a minute; the next line has the number of those held back.
     """
 
     needs_pictures = False
@@ -46,7 +46,7 @@ class JsonLog(RunObserver):
         self._num_frames = 0
         self._progress_s = time.monotonic()
         self._lock = threading.Lock()
-        self._passed_s: dict[_Kind, float] = {}  # the longest silent first
+        self._passed_s: dict[_Kind, float] = {}  # time of the last line; the oldest first
         self._held_back: dict[_Kind, int] = {}
 
     def warn(self, line: str) -> None:
@@ -131,7 +131,7 @@ def notify(line: str) -> None:
 
 
 class WatchObserver(RunObserver):
-    """Passes all events to another observer, serves them, and reports to systemd that it lives."""
+    """Passes all events to another observer, serves them, and reports to systemd: it is alive."""
 
     def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
@@ -142,7 +142,7 @@ class WatchObserver(RunObserver):
         self._opened = ExitStack()
 
     def open(self, inputs: Inputs, store: LengthStore, hauls: HaulLog, sinks: SinkStates) -> None:
-        """Serve as set in `[watch]`; ConfigError or OutputError if it can't listen there."""
+        """Serve as set in `[watch]`. Raises ConfigError or OutputError if it can't listen there."""
         self._observer.open(inputs, store, hauls, sinks)
         config, out = inputs.config, inputs.request.out
         settings = config.watch

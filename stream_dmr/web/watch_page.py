@@ -1,4 +1,4 @@
-"""The status page of a run, with health, metrics and pictures."""
+"""Serve the status page of a run, with health, metrics and pictures."""
 
 import json
 import threading
@@ -37,7 +37,7 @@ _JPEG_QUALITY = 75
 
 
 def draw_fish(measured: MeasuredFrame) -> UInt8[np.ndarray, "H W 3"]:
-    """The frame, no longer than 960 px, with head, center and tail of each fish and its length."""
+    """The frame, at most 960 px long, with head, center, tail and length of each fish."""
     image = measured.frame.image
     scale = min(1.0, _MAX_SIDE_PX / max(image.shape[:2]))
     drawn = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -64,7 +64,7 @@ def _write_label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int,
         cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, thickness, cv2.LINE_AA)
 
 
-_PICTURE_INTERVAL_S = 0.5  # all requests in it share a picture: measuring must not slow down
+_PICTURE_INTERVAL_S = 0.5  # requests within it get the same picture: measuring must stay fast
 _MIN_TOKEN_CHARACTERS = 16
 
 
@@ -75,7 +75,7 @@ class WatchServer(TokenServer):
     setting = "host or port of [watch]"
 
     def __init__(self, state: RunState, settings: WatchSettings) -> None:
-        """ConfigError if others could read along without a token; OutputError for the port."""
+        """Raises ConfigError if other machines need no token, and OutputError for the port."""
         self._state = state
         registry = make_registry(state)
         self._picture_lock = threading.Lock()
@@ -101,15 +101,16 @@ class WatchServer(TokenServer):
         """Begin or end a haul."""
         if self._state.hauls is None:
             raise UserError("expected a run that takes hauls")
-        told = None
+        submitted = None
         with suppress(ValueError, RecursionError):
-            told = json.loads(request.body)
-        if not isinstance(told, dict):
+            submitted = json.loads(request.body)
+        if not isinstance(submitted, dict):
             got = request.body.decode(errors="replace")
             raise UserError(
                 f"expected a haul as a JSON object with what, name, said_by, got {got!r}"
             )
-        what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
+        keys = ("what", "name", "said_by")
+        what, name, said_by = (str(submitted.get(key) or "") for key in keys)
         return json_response({"name": self._state.hauls.tell(what, name, said_by=said_by)})
 
     def _latest_picture(self) -> bytes:
@@ -187,7 +188,7 @@ def positions_json(state: RunState) -> dict[str, Any] | None:
 
 
 def _warnings_json(state: RunState) -> list[dict[str, Any]]:
-    """The warnings, the latest first; `age_s` is since the last time that it came."""
+    """The warnings, the latest first; `age_s`: seconds since a warning last came."""
     now_s = time.monotonic()
     return [
         {"line": warning.line, "count": warning.count, "age_s": now_s - warning.last_s}
@@ -204,7 +205,7 @@ def status_json(state: RunState) -> dict[str, Any]:
         "fates": dict(state.fates.most_common()),
         "fish_per_hour": state.fish_per_hour(),
         "positions": positions_json(state),
-        # None of a run that takes no hauls; the name is "" between hauls
+        # None if the run takes no hauls; the name is "" between hauls
         "haul": None if state.hauls is None else {"name": "" if haul is None else haul.name},
         "frames_per_s": state.frames_per_s(),
         "last_frame_age_s": state.last_frame_age_s(),
