@@ -12,18 +12,19 @@ import pytest
 
 from stream_dmr.messages import TrackEnded
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.nodes.fit_mesh import FitMesh
-from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.chain import Node
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import Session, Setup
+from stream_dmr.template.template_file import load_template
 from tests.support.named_modules import unnamed_modules
 
 ROOT = Path(__file__).resolve().parents[1]
 # A link to nodes/, so that an installation adds one name to import; globs don't follow it.
 LINKED = ROOT / "stream_dmr" / "nodes"
 FILES = sorted([*(ROOT / "stream_dmr").rglob("*.py"), *LINKED.glob("*.py")])
-NODES = [CropFish, FitMesh, Localize, SmoothLength]
+_SETUP = Setup(config=Config(), template=load_template("cod"), calibration=None)
+NODES = [CropFish, *map(type, Session(_SETUP).nodes)]
 # Modules beside the packages, from the top down.
 GROUND_FLOOR = [
     f"stream_dmr.{name}"

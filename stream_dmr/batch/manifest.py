@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
+from typing import get_type_hints
 
 from stream_dmr.errors import SourceError, UserError, reason_of
 from stream_dmr.files import read_text
@@ -18,9 +19,17 @@ from stream_dmr.version import __version__
 
 # Options of `run` by their names; `video` is --source.
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
-MORE_COLUMNS = ("nmea", "start_utc")  # that a manifest may have as well
+_OF_BATCH = ("source", "out", "template", "config", "key", "command")  # not of a row
+_TYPES = get_type_hints(RunOptions)
+# That a manifest may have as well: the other options that are a text or a file.
+MORE_COLUMNS = tuple(
+    name
+    for name, kind in _TYPES.items()
+    if name not in (*COLUMNS, *_OF_BATCH) and kind in (str, str | None, Path | None)
+)
 _MAX_BYTES = 100_000_000  # of a manifest: a million videos
-_FILES = (*COLUMNS[:4], "nmea")
+_FILES = ("video", *(n for n in (*COLUMNS[1:], *MORE_COLUMNS) if _TYPES[n] == Path | None), "nmea")
+_HASHED = (*(name for name in _FILES if name not in ("video", "masks")), "config")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +52,7 @@ class Job:
         """
         stamps = [_size_and_time(self.given.get(name, "")) for name in ("source", "masks")]
         mesh = Path(self.options.template)
-        small = [self.given.get(name, "") for name in ("calibration", "boxes", "nmea", "config")]
+        small = [self.given.get(name, "") for name in _HASHED]
         small += [str(mesh), str(mesh.with_suffix(".toml"))]
         hashes = [_content_hash(path) for path in small]
         inputs = [__version__, asdict(self), stamps, hashes]
@@ -105,8 +114,8 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
         ) from error
     if sorted(columns) != sorted({*COLUMNS, *(set(columns) & set(MORE_COLUMNS))}):
         raise UserError(
-            f"{path}: expected the columns {','.join(COLUMNS)}, and {','.join(MORE_COLUMNS)} where "
-            f"there are positions, got {','.join(columns) or 'none'}"
+            f"{path}: expected the columns {','.join(COLUMNS)}, and perhaps "
+            f"{','.join(MORE_COLUMNS)}, got {','.join(columns) or 'none'}"
         )
     if not rows:
         raise UserError(f"{path}: expected a row for each video, got none")

@@ -55,10 +55,10 @@ from stream_dmr.store.ledger import content_sha256, lines_sha256
 from stream_dmr.store.run_facts import NOT_ENDED, RunFacts, run_facts
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.store.schema import (
-    CATCH_COLUMNS,
     ESTIMATE_COLUMNS,
     EVENTS,
     FISH,
+    LATER_COLUMNS,
     POSITIONS,
     WATCHED,
     check_lines,
@@ -453,7 +453,7 @@ def _recording(
             if stored is None:
                 yield Change(database, f"{name} is missing; {path.name} has it")
                 continue
-            for column in (*ESTIMATE_COLUMNS, *CATCH_COLUMNS):
+            for column in (*ESTIMATE_COLUMNS, *LATER_COLUMNS):
                 now, was = stored.get(column), getattr(message, column)
                 if now != was:
                     yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")

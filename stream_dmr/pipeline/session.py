@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryFile
 from typing import IO, TypeVar
@@ -152,16 +152,21 @@ class Session:
         *,
         given: Sequence[Node] = (),
         first: Stage = "crop",
-        last: Stage = "smooth",
+        last: Stage | None = None,
     ) -> None:
-        """`given`: a CropFish, the crops of a first pass, or the playback of a recording."""
-        stages = [*STAGES.values()][stage_number(first) : stage_number(last) + 1]
+        """`given`: a CropFish, the crops of a first pass, or the playback of a recording.
+
+        `last`: the last stage; None: that of the chain.
+        """
+        end = None if last is None else stage_number(last) + 1
+        stages = [*STAGES.values()][stage_number(first) : end]
         self.nodes = [*given, *(stage.make(setup) for stage in stages if stage.make is not None)]
 
     def continue_tracks(self, interrupted: Iterable[LocalizedFish]) -> None:
-        """Give the last node the frames of fish that an earlier recording has."""
-        for fish in interrupted:
-            self.nodes[-1].step(fish)
+        """Give SmoothLength the frames of fish that an earlier recording has."""
+        for fish, node in product(interrupted, self.nodes):
+            if isinstance(node, SmoothLength):
+                node.step(fish)
 
     def messages(self, inputs: Iterable[Message], settings: RecordingSettings) -> Iterator[Message]:
         """Messages of all nodes, each as a recording with these settings hands it to the next node.

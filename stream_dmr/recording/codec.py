@@ -13,7 +13,7 @@ from functools import cache, partial
 from importlib.resources import files
 from io import BytesIO
 from itertools import chain
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -205,9 +205,7 @@ T = TypeVar("T")
 DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
-        *(messages.Frame, messages.FishCrop, messages.FittedMesh),
-        *(messages.LocalizedFish, messages.LengthEstimate, messages.Position),
-        *(messages.LearntShapes, messages.TrackEnded),
+        *get_args(messages.Message),
         *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
         *(messages.LossTerms, messages.SolverReport),
         *(Camera, ReferencePlane, Calibration),

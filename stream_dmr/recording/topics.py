@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field
 
@@ -63,6 +63,10 @@ VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
 MessageTypes = Collection[type[Message]]
 Topics = Mapping[type[Message], Topic]
 TOPICS: Topics = {
+    # A message without a row below has the name of its class as topic, and is not drawn.
+    kind: Topic(message=kind, topic=f"/{kind.__name__.lower()}", entities=())
+    for kind in get_args(Message)
+} | {
     row.message: row
     for row in (
         Topic(message=Frame, topic="/frame", entities=(FRAME,)),

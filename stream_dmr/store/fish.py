@@ -18,9 +18,9 @@ from stream_dmr.store.edits import TrackPart, edits_of
 from stream_dmr.store.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.store.scale_checks import last_checks
 from stream_dmr.store.schema import (
-    CATCH_COLUMNS,
     FISH,
     HAULS,
+    LATER_COLUMNS,
     NAME,
     RUNS,
     Table,
@@ -279,11 +279,11 @@ def run_times(database: Path) -> dict[str, list[int | None]]:
 def rows_by_run(database: Path, table: Table) -> dict[str, list[str]]:
     """Every stored value of the rows of each run, as lines of JSON, for checksums.
 
-    CATCH_COLUMNS are there by name if they have a value, since older databases lack them.
+    LATER_COLUMNS are there by name if they have a value, since older databases lack them.
     """
     lines: dict[str, list[str]] = {}
     for row in read_rows(database, table):
-        added = {name: row.pop(name, None) for name in CATCH_COLUMNS}
+        added = {name: row.pop(name, None) for name in LATER_COLUMNS}
         facts = {name: value for name, value in added.items() if value is not None}
         line = [*row.values(), *([facts] if facts else [])]
         lines.setdefault(row["run_id"], []).append(json.dumps(line, default=repr))

@@ -29,11 +29,11 @@ from stream_dmr.store.ledger import (
 )
 from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
-    CATCH_COLUMNS,
     CHECKS,
     CLIPS,
     EVENTS,
     FISH,
+    LATER_COLUMNS,
     MARK,
     NAME,
     REVIEWED_ID,
@@ -242,7 +242,7 @@ class LengthStore:
 
         `iou`: median over its accepted frames, of mesh and mask.
         """
-        catch = {name: getattr(estimate, name) for name in CATCH_COLUMNS}
+        catch = {name: getattr(estimate, name) for name in LATER_COLUMNS}
         row = fish_row(estimate, flags) | {"iou": iou} | catch
         self.append(FISH, str(estimate.track_id), row)
 

@@ -183,7 +183,6 @@ LEDGER = Table("chain")
 MARKS = Table("marks", order="name")
 CLIPS = Table("clips", order="name")
 SCENES = Table("scenes", order="calibration_sha256")
-CATCH_COLUMNS = ("species_code", "species_share", "fate", "fate_share")
 
 
 @cache
@@ -495,9 +494,13 @@ ESTIMATE_COLUMNS = [
     *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
 ]
 
+_FISH_COLUMNS = [*FISH.columns]
+LATER_COLUMNS = _FISH_COLUMNS[_FISH_COLUMNS.index("written_ns") + 1 :]
+"""Columns of `fish` that older databases lack: attributes of the final estimate."""
+
 
 def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
-    """The columns of a final estimate but CATCH_COLUMNS, which an edit of a fish has not."""
+    """The columns of a final estimate but LATER_COLUMNS, which an edit of a fish has not."""
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
     row: dict[str, object] = {name: getattr(estimate, name) for name in ESTIMATE_COLUMNS}
     return row | {
@@ -517,7 +520,7 @@ def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
     """The final estimate of a row of `fish`, without its smoothed series."""
     low, high = row["ci95_low_mm"], row["ci95_high_mm"]
     values: dict[str, Any] = {name: row[name] for name in ESTIMATE_COLUMNS}
-    values |= {name: row.get(name) for name in CATCH_COLUMNS}
+    values |= {name: row.get(name) for name in LATER_COLUMNS}
     return LengthEstimate(
         **values,
         refused=json.loads(row["refused"]),

@@ -8,10 +8,10 @@ from typing import Any
 from stream_dmr.export.fish_table import FISH_TABLE
 from stream_dmr.store.fish import read_stored_fish, rows_by_run
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import CATCH_COLUMNS, FISH
+from stream_dmr.store.schema import FISH, LATER_COLUMNS
 from tests.support.final_estimates import FACTS, fish
 
-UNKNOWN: dict[str, Any] = dict.fromkeys(CATCH_COLUMNS)
+UNKNOWN: dict[str, Any] = dict.fromkeys(LATER_COLUMNS)
 LANDED: dict[str, Any] = {"species_code": "HAL", "species_share": 0.9, "fate": "landed"}
 LANDED["fate_share"] = 0.8
 
@@ -26,7 +26,7 @@ def stored(folder: Path, *catches: Mapping[str, Any]) -> Path:
 
 def catches_of(database: Path) -> list[dict[str, Any]]:
     stored_fish = read_stored_fish(database)
-    return [{name: getattr(one.estimate, name) for name in CATCH_COLUMNS} for one in stored_fish]
+    return [{name: getattr(one.estimate, name) for name in LATER_COLUMNS} for one in stored_fish]
 
 
 def test_facts_are_read_as_they_were_written(tmp_path: Path):
@@ -35,13 +35,13 @@ def test_facts_are_read_as_they_were_written(tmp_path: Path):
 
 
 def test_facts_are_columns_of_the_exported_fish():
-    assert set(CATCH_COLUMNS) <= FISH_TABLE.keys()
+    assert LANDED.keys() <= FISH_TABLE.keys()
 
 
 def test_an_older_database_keeps_its_checksums_and_takes_facts(tmp_path: Path):
     database = stored(tmp_path, UNKNOWN, UNKNOWN)
     with sqlite3.connect(database) as older:
-        for name in reversed(CATCH_COLUMNS):
+        for name in reversed(LATER_COLUMNS):
             older.execute(f"ALTER TABLE fish DROP COLUMN {name}")
     before = rows_by_run(database, FISH)
     assert catches_of(database) == [UNKNOWN] * 2
