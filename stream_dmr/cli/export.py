@@ -65,7 +65,6 @@ def export(
         )
     from stream_dmr.evidence.seal import NAME as PROVENANCE
     from stream_dmr.export.exporter import Export
-    from stream_dmr.pipeline.run_inputs import species_notes
     from stream_dmr.store.fish import run_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
@@ -79,10 +78,7 @@ def export(
                 print(path)
         if fish:
             settings = settings_of(config, exported.header.config_toml, recording)
-            path = exported.fish(out, settings.fisheries, format=fish, all_columns=all_columns)
-            notes = species_notes(settings, exported.header.template)
-            exported.notes = notes or exported.notes
-            print(path)
+            print(exported.fish(out, settings, format=fish, all_columns=all_columns))
         if viame:
             path = out / "tracks.viame.csv"
             print(f"{path}: {exported.viame(path)} boxes")

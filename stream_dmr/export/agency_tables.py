@@ -8,7 +8,13 @@ Fields that a camera can't know stay empty: nothing is guessed. Sources: draft l
 from collections.abc import Mapping
 from dataclasses import replace
 
-from stream_dmr.export.darwin_core import CAMTRAP_TABLES, OBIS_TABLES, FishTable, fish_id
+from stream_dmr.export.darwin_core import (
+    CAMTRAP_TABLES,
+    OBIS_TABLES,
+    FishTable,
+    archive_description,
+    fish_id,
+)
 from stream_dmr.export.export_choices import Agency
 from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.lengths.fate import FATE_OF_ZONE
@@ -130,3 +136,4 @@ AGENCIES: Mapping[Agency, Mapping[str, FishTable]] = {
     Agency.OBIS: {f"obis/{name}": table for name, table in OBIS_TABLES.items()},
     Agency.CAMTRAP_DP: {f"camtrap-dp/{name}": table for name, table in CAMTRAP_TABLES.items()},
 }
+AGENCY_TEXTS = {Agency.OBIS: {"obis/meta.xml": archive_description()}}  # beside the tables

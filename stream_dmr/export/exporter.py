@@ -13,9 +13,14 @@ import trimesh
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.own_files import require_writable
 from stream_dmr.evidence.seal import known_files, read_origin, seal_files
-from stream_dmr.export.agency_tables import AGENCIES, HAUL_COLUMNS, haul_row, template_of
+from stream_dmr.export.agency_tables import (
+    AGENCIES,
+    AGENCY_TEXTS,
+    HAUL_COLUMNS,
+    haul_row,
+    template_of,
+)
 from stream_dmr.export.coco_masks import coco_masks, is_picture
-from stream_dmr.export.darwin_core import archive_description
 from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 from stream_dmr.export.fish_table import (
     FISH_TABLE,
@@ -28,6 +33,8 @@ from stream_dmr.export.fish_table import (
 from stream_dmr.export.viame_csv import viame_csv
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.run_inputs import species_notes
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.reading import (
     decoded_messages,
@@ -43,7 +50,6 @@ from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import Fish, database_of, read_fish, read_runs
-from stream_dmr.store.fisheries import FisheriesSettings
 from stream_dmr.store.open_results import open_results, require_recording
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, write_lengths
@@ -190,7 +196,7 @@ class Export:
     def fish(
         self,
         out: Path,
-        settings: FisheriesSettings,
+        config: Config,
         *,
         format: TableFormat,
         all_columns: bool = False,
@@ -202,8 +208,9 @@ class Export:
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        records = [fish_record(fish, self.header.template, settings, checks) for fish in self._fish]
-        self.notes += unweighed_note(records, settings)
+        template, settings = self.header.template, config.fisheries
+        records = [fish_record(fish, template, settings, checks) for fish in self._fish]
+        self.notes += species_notes(config, template) or unweighed_note(records, settings)
         with self._writing(path):
             if format == "csv":
                 write_csv(path, FISH_TABLE if all_columns else used_columns(records), records)
@@ -250,7 +257,7 @@ class Export:
         return len(boxes)
 
     def agency(self, out: Path, agency: Agency) -> list[Path]:
-        """Write the tables of AGENCIES; rejected fish and doubles are left out."""
+        """Write the tables of AGENCIES and AGENCY_TEXTS; rejected fish and doubles are left out."""
         fish = [
             (caught, template_of(caught, self.header.template))
             for caught in self._fish
@@ -260,19 +267,19 @@ class Export:
             out / name: (columns, [row for entry in fish for row in rows_of(*entry)])
             for name, (columns, rows_of) in AGENCIES[agency].items()
         }
-        meta = [out / "obis" / "meta.xml"] if agency is Agency.OBIS else []
-        self._require_writable(*tables, *meta)
+        texts = {out / name: text for name, text in AGENCY_TEXTS.get(agency, {}).items()}
+        self._require_writable(*tables, *texts)
         for path, (columns, rows) in tables.items():
             with self._writing(path):
                 write_csv(path, columns, rows)
-        for path in meta:
+        for path, text in texts.items():
             with self._writing(path):
-                path.write_text(archive_description(), encoding="utf-8")
+                path.write_text(text, encoding="utf-8")
         first, (_, rows) = next(iter(tables.items()))
         if lacking := len(fish) - len(rows):
             why = "have no time in UTC, or no species where it needs one, and are left out"
             self.notes.append(f"{first.name}: {lacking} of {len(fish)} fish {why}")
-        return [*tables, *meta]
+        return [*tables, *texts]
 
     def hauls(self, out: Path) -> Path:
         """Write hauls.csv: each haul with its effort. Raises OutputError without a lengths.db."""

@@ -18,7 +18,7 @@ from stream_dmr.export.agency_tables import template_of
 from stream_dmr.export.exporter import Export
 from stream_dmr.export.fish_table import FISH_TABLE
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
-from stream_dmr.pipeline.config import parse_config
+from stream_dmr.pipeline.config import Config, parse_config
 from stream_dmr.species import find_species, load_species
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive, whole_cm
@@ -110,7 +110,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def exported(out: Path, folder: Path, **fisheries: object) -> list[dict[str, str]]:
     export = Export(out)
-    settings = FisheriesSettings(**{"species": "tiny", **fisheries})  # type: ignore[arg-type]
+    settings = Config.model_validate({"fisheries": {"species": "tiny", **fisheries}})
     with export.into(folder):
         path = export.fish(folder, settings, format="csv", all_columns=True)
     with path.open(newline="") as file:
@@ -175,9 +175,17 @@ def test_every_export_names_what_made_it(finished: Path, tmp_path: Path):
     assert made["files"] == {"fish.csv": sha256((tmp_path / "fish.csv").read_bytes()).hexdigest()}
 
 
+def test_an_unknown_species_is_the_only_note_on_weights(finished: Path, tmp_path: Path):
+    export = Export(finished)
+    export.fish(tmp_path, Config(fisheries=FisheriesSettings(species="tinny")), format="csv")
+    (note,) = export.notes
+    assert note.endswith("no weight and no legal size; did you mean 'tiny'?")
+
+
 def test_parquet_is_the_same_table(finished: Path, tmp_path: Path):
     rows = exported(finished, tmp_path)
-    path = Export(finished).fish(tmp_path, FisheriesSettings(species="tiny"), format="parquet")
+    settings = Config(fisheries=FisheriesSettings(species="tiny"))
+    path = Export(finished).fish(tmp_path, settings, format="parquet")
     table = parquet.read_table(path)
     assert table.column_names == list(FISH_TABLE)
     for row, exact in zip(rows, table.to_pylist(), strict=True):
