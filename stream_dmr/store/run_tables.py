@@ -208,7 +208,6 @@ class FramesTable:
 
     def write(self, record: Record) -> None:
         """Take any record; raises OutputError if the disk refuses a row, or the file is lost."""
-        self._table.require_name()  # also if no row follows, else it would pass for a written row
         message = record.message
         if isinstance(message, LocalizedFish) and not record.is_second:
             self._waiting[message.track_id, message.frame_index] = message
@@ -216,6 +215,8 @@ class FramesTable:
             fish = self._waiting.pop((message.track_id, message.frame_index), None)
             if fish is not None:
                 self._table.add(frames_row(fish, message.is_frame_used, message.frame_reason))
+                return
+        self._table.require_name()  # else it would pass for a written row
 
     def close(self) -> None:
         """Write the rows that no estimate followed, with the localization's verdict. Idempotent."""
