@@ -224,7 +224,7 @@ class SpeciesEvidence:
         posterior = self.posterior()
         if not posterior:
             return None
-        code = max(posterior, key=lambda code: posterior[code])
+        code = max(posterior, key=posterior.__getitem__)
         return SpeciesFound(code, posterior[code])
 
 

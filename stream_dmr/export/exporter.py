@@ -134,8 +134,7 @@ class Export:
         """
         self._require_writable(path, needed_for="--masks")
         placed = {
-            (placed.track_id, placed.frame_index): placed
-            for placed in self._reviewed.of(LocalizedFish)
+            (fish.track_id, fish.frame_index): fish for fish in self._reviewed.of(LocalizedFish)
         }
         coco = coco_masks(
             (
@@ -313,12 +312,12 @@ class Export:
             require_messages(self.recording)
         if self._selection.is_everything:
             return
-        fish = {fish.estimate.track_id for fish in self._fish}
-        if not fish:
+        track_ids = {fish.estimate.track_id for fish in self._fish}
+        if not track_ids:
             require_time(self.recording, self._selection)
         if self._selection.tracks is not None:
-            fish |= {seen.track_id for seen in self._reviewed.of(LocalizedFish)}
-            require_tracks(self._selection, fish)
+            track_ids |= {fish.track_id for fish in self._reviewed.of(LocalizedFish)}
+            require_tracks(self._selection, track_ids)
 
     def _require_writable(self, *paths: Path, needed_for: str = "") -> None:
         """UserError if a file may not be written, or an option needs a lost recording."""

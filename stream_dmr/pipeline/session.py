@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryFile
 from typing import IO, TypeVar
@@ -164,9 +164,10 @@ class Session:
 
     def continue_tracks(self, interrupted: Iterable[LocalizedFish]) -> None:
         """Give SmoothLength the frames of fish that an earlier recording has."""
-        for fish, node in product(interrupted, self.nodes):
+        for node in self.nodes:
             if isinstance(node, SmoothLength):
-                node.step(fish)
+                for fish in interrupted:
+                    node.step(fish)
 
     def messages(self, inputs: Iterable[Message], settings: RecordingSettings) -> Iterator[Message]:
         """Messages of all nodes, each as a recording with these settings hands it to the next node.

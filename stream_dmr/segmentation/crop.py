@@ -409,7 +409,7 @@ def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedC
     if not view.settings.second_look or wider.extent is None:
         return crop
     second = crop_segmented(view, wider.extent, segmenter)
-    surer = max(crop, second, key=lambda crop: crop.confidence or 0.0)
+    surer = max(crop, second, key=lambda look: look.confidence or 0.0)
     # The first look decides whether it is a fish: the better of two would accept more false ones.
     return replace(_lengthened(view, surer, segmenter), confidence=crop.confidence)
 

@@ -139,7 +139,7 @@ def thinned(positions: Sequence[KeptPosition], *, most: int) -> list[KeptPositio
     step = max(1, -(-len(positions) // most))
     starts = range(0, len(positions), step)
     passed = (positions[max(0, i - step + 1) : i + 1] for i in starts)
-    return [replace(step[-1], is_joined=all(each.is_joined for each in step)) for step in passed]
+    return [replace(run[-1], is_joined=all(each.is_joined for each in run)) for run in passed]
 
 
 def kept_of(

@@ -189,8 +189,9 @@ class TrackedFish:
         waiting = [
             track
             for track, seen in self._evidence.items()
-            if seen.has_moved and seen.closer_looks < _MAX_CLOSER_LOOKS
-            if not self._may_count(track)
+            if seen.has_moved
+            and seen.closer_looks < _MAX_CLOSER_LOOKS
+            and not self._may_count(track)
         ]
         if waiting:
             track = min(waiting, key=lambda track: self._evidence[track].closer_looks)

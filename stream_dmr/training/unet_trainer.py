@@ -239,7 +239,7 @@ class UNetTrainer:
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "history": [asdict(scores) for scores in self.history],
+            "history": [asdict(epoch_scores) for epoch_scores in self.history],
         }
         with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
             torch.save(state, draft)

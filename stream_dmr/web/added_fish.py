@@ -224,10 +224,10 @@ class TrackEditor:
     ) -> list[dict[str, Any]]:
         """The final row of each fish."""
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
-        measured = {fish.estimate.track_id: fish for fish in read_measured_fish(self._database)}
-        last = {track_id: fish.estimate.last_frame for track_id, fish in measured.items()}
+        measured = [caught.estimate for caught in read_measured_fish(self._database)]
+        last = {estimate.track_id: estimate.last_frame for estimate in measured}
         frames = frames_of_tracks(report.recording, self._database, tracks, last)
-        flags = {fish.estimate.track_id: fish.flags for fish in report.fish}
+        flags = {caught.estimate.track_id: caught.flags for caught in report.fish}
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
             chosen = frames_of_parts(frames, of_fish, fish=fish)

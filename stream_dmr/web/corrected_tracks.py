@@ -238,7 +238,7 @@ class _Corrections:
 
     def _name(self, fish: int, track: int) -> None:
         named = self._file.species[track] - {*_NO_SPECIES}
-        known = {fish.estimate.track_id: fish for fish in self._recorder.report.fish}
+        known = {caught.estimate.track_id: caught for caught in self._recorder.report.fish}
         before = species_name(known[fish])
         if len(named) > 1 or (not named and before != NO_SPECIES):
             raise AnnotationError(

@@ -153,7 +153,7 @@ class RunState:
             by_index = {kept.frame_index: kept for kept in self._frames}
             if self._fish and self._fish[-1].frame_index in by_index:
                 frame = by_index[self._fish[-1].frame_index]
-            fish = [fish for fish in self._fish if fish.frame_index == frame.frame_index]
+            fish = [seen for seen in self._fish if seen.frame_index == frame.frame_index]
             return MeasuredFrame(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
 
     def frames_per_s(self) -> float:

@@ -167,8 +167,9 @@ class VerdictRecorder:
         with self._lock:
             verdicts = read_verdicts(self._database)
             self._follow(verdicts)
-            named = {number for v in verdicts for number in (v.track_id, v.other_fish)}
-            return self.report, self._reviews(verdicts), {n for n in named if n is not None}
+            named = {v.track_id for v in verdicts}
+            named |= {v.other_fish for v in verdicts if v.other_fish is not None}
+            return self.report, self._reviews(verdicts), named
 
     def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
         """The reviews of this reading: a blind reader sees no other verdicts."""

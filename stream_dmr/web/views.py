@@ -272,8 +272,8 @@ def draw_views(
     for frame_index, image in chain(images, without):  # the first image of a frame is drawn
         for track_id, view in waiting.pop(frame_index, []):
             drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
-    for views in drawn_views.values():
-        views.sort(key=lambda view: view.recorded.rank, reverse=True)
+    for drawn in drawn_views.values():
+        drawn.sort(key=lambda view: view.recorded.rank, reverse=True)
     return drawn_views
 
 
