@@ -41,7 +41,7 @@ class CropFish:
         """
         self._finder = finder
         self._numbering = TrackNumbering(keeps_source_ids=finder.open_ids is None)
-        self._segmenter = None if finder.gives_masks else open_segmenter(settings.segmenter)
+        self._segmenter = None if finder.has_masks else open_segmenter(settings.segmenter)
         self._classifier = SpeciesClassifier(Path(species_model)) if species_model else None
         self._settings = settings
         self._camera = camera

@@ -21,7 +21,7 @@ class ReadFrames:
         """Continue the frame numbers of earlier runs; call it before the iteration."""
         self._offset = frame_index
 
-    def give_again(self, frames: Iterable[Frame]) -> None:
+    def replace_frames(self, frames: Iterable[Frame]) -> None:
         """Iterate over these frames next; the source returned them before and is closed."""
         self._frames = frames
 

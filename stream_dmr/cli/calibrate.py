@@ -40,7 +40,7 @@ def calibrate(
     marker_mm: MarkerOption = None,
     model: Annotated[
         str,
-        "pinhole, or fisheye for very wide lenses and domes; auto takes the fisheye where "
+        "pinhole, or fisheye for very wide lenses and domes; auto takes the fisheye if "
         "the pinhole fits badly and the fisheye does not.",
     ] = "auto",
     lens: Annotated[

@@ -75,7 +75,7 @@ def import_(
 ) -> None:
     """Take what was corrected in a file of tracks as verdicts and edits into lengths.db.
 
-    All of it or, where something can't be a verdict, nothing.
+    All of it or, if something can't be a verdict, nothing.
     """
     from getpass import getuser
 

@@ -81,7 +81,7 @@ def demo(
 ) -> None:
     """Measure the fish of the embedded scene from its video, and print the true lengths beside.
 
-    Exits with 1 where a fish was not measured.
+    Exits with 1 if a fish was not measured.
     """
     from stream_dmr.simulation import DEMO_SCENE
 

@@ -17,7 +17,7 @@ def make_template(
     top: Annotated[Path | None, "Mask of the same fish, or its like, seen from above."] = None,
     thickness: Annotated[
         float | None,
-        "Largest thickness over largest breadth, where there is no --top.",
+        "Largest thickness over largest breadth, if there is no --top.",
         "that of the bundled body form nearest in outline",
     ] = None,
     overwrite: OverwriteOption = False,

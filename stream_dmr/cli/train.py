@@ -93,10 +93,10 @@ def evaluate(
     from stream_dmr.evaluation.length_tables import is_histogram
     from stream_dmr.evidence.own_files import is_made_by, require_writable
     from stream_dmr.pipeline.config import load_config
-    from stream_dmr.store.fish import numbers_its_own
+    from stream_dmr.store.fish import assigns_ids
 
     settings = load_config(config).evaluate
-    if not is_histogram(truth) and numbers_its_own(lengths.parent):
+    if not is_histogram(truth) and assigns_ids(lengths.parent):
         warn([_NOT_THE_SAME_IDS])
     if is_histogram(truth):
         distributions = evaluate_histogram(lengths, truth, settings=settings)

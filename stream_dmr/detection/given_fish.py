@@ -80,7 +80,7 @@ class AnnotatedFish:
         self._pictures_of = defaultdict[int, set[int]](set)  # of stills: id -> frames
 
     @property
-    def gives_masks(self) -> bool:
+    def has_masks(self) -> bool:
         """True with a masks folder, and if there are boxes and each has a mask of its own."""
         boxes = [*chain.from_iterable((self._boxes or {}).values())]
         has_all = bool(boxes) and all(box.mask is not None for box in boxes)
@@ -240,7 +240,7 @@ class NamedPictures:
         self._seen: set[str] = set()
 
     @property
-    def gives_masks(self) -> bool:
+    def has_masks(self) -> bool:
         """True with a masks folder."""
         return self._masks is not None
 

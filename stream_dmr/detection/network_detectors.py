@@ -142,7 +142,7 @@ class OnnxDetector:
         return {}
 
     @property
-    def gives_masks(self) -> bool:
+    def has_masks(self) -> bool:
         return self._settings.onnx_layout in MASKS
 
     def find(self, frame: Frame) -> list[Candidate]:

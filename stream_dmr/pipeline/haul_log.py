@@ -71,7 +71,7 @@ class HaulLog:
         hauls = self.hauls()
         return hauls[-1] if hauls and hauls[-1].ended_ns is None else None
 
-    def tell(self, what: str, name: str = "", *, said_by: str) -> str:
+    def mark(self, what: str, name: str = "", *, said_by: str) -> str:
         """Begin or end a haul now; returns its name. Raises UserError if that makes no sense."""
         with self._lock:
             current = self.current()

@@ -119,12 +119,12 @@ def compare_with_mesh(
         progress("measuring some of them by both shapes")
         return _shift(by_mesh(), _lengths(frames, setup, stocks))
 
-    def suffices(stocks: CandidateShapes) -> bool:
+    def is_enough(stocks: CandidateShapes) -> bool:
         shift = shift_of(stocks)
         return shift is not None and shift.off <= _SURELY_ALLOWED
 
     # Only shapes that would be disbelieved are learnt for longer.
-    stocks = setup.learn(crops, mesh, suffices=suffices, progress=progress)
+    stocks = setup.learn(crops, mesh, is_enough=is_enough, progress=progress)
     return MeshComparison(
         mesh=mesh, stocks=stocks, shift=None if stocks is None else shift_of(stocks)
     )
@@ -212,7 +212,7 @@ def _first_pass(
     if frames is None:
         reader = ReadFrames(inputs.request.source, config.read_frames)
     else:
-        reader.give_again(frames)
+        reader.replace_frames(frames)
     return replace(inputs, reader=reader, crops=crops, kept_frames=frames), crops
 
 

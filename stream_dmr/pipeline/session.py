@@ -67,7 +67,7 @@ class Setup:
         crops: Iterable[FishCrop],
         forms: CandidateShapes,
         *,
-        suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+        is_enough: Callable[[CandidateShapes], bool] = lambda stocks: False,
         progress: Callable[[str], None] = lambda step: None,
     ) -> CandidateShapes | None:
         """The stocks of these fish, learnt from `forms` on: see `learn_shapes`."""
@@ -78,7 +78,7 @@ class Setup:
             self.config.fit_mesh,
             calibration=self.calibration,
             species=self.config.species,
-            suffices=suffices,
+            is_enough=is_enough,
             progress=progress,
         )
 

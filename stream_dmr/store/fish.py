@@ -261,7 +261,7 @@ def _clock_notes(database: Path, runs: Mapping[str, RunFacts]) -> Iterator[str]:
             )
 
 
-def numbers_its_own(folder: Path) -> bool:
+def assigns_ids(folder: Path) -> bool:
     """True if a run in a folder was given no ids of its fish. Raises OutputError."""
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)

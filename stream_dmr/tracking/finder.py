@@ -146,14 +146,14 @@ class TrackedFish:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """All tracks seen in a frame, by track number. Frames must come in order."""
-        if self._are_stills and not self.gives_masks:
+        if self._are_stills and not self.has_masks:
             candidates = find_in_still(self._detector, frame)
         else:
             candidates = [] if self._passes_over(frame) else self._detector.find(frame)
         tracked = self._tracker.step(frame, candidates)
         self._seen.frames += 1
         self._seen.candidates += len(candidates)
-        if self.gives_masks:
+        if self.has_masks:
             tracked = [fish for fish in tracked if fish.candidate.foreground is not None]
         boxes = {fish.track_number: fish.candidate.bbox_xyxy_px for fish in tracked}
         visible = {fish.track_number: fish.visible_fraction for fish in tracked}
@@ -167,7 +167,7 @@ class TrackedFish:
         return [
             replace(
                 detection,
-                mask=masks[detection.source_id] if self.gives_masks else None,
+                mask=masks[detection.source_id] if self.has_masks else None,
                 mask_corner=whole_pixels(boxes[detection.source_id])[:2],
                 may_be_no_fish=not self._is_surely_fish(detection.source_id),
             )
@@ -237,9 +237,9 @@ class TrackedFish:
         return fish
 
     @property
-    def gives_masks(self) -> bool:
+    def has_masks(self) -> bool:
         """True if the detector finds masks as well; else the segmenter finds them."""
-        return isinstance(self._detector, OnnxDetector) and self._detector.gives_masks
+        return isinstance(self._detector, OnnxDetector) and self._detector.has_masks
 
     @property
     def warnings(self) -> list[str]:
@@ -265,7 +265,7 @@ class FishFinder(Protocol):
     """Finds the fish of each frame: `detect` before the crops are cut, then `confirm`."""
 
     @property
-    def gives_masks(self) -> bool:
+    def has_masks(self) -> bool:
         """True if every detection comes with a mask, so that no segmenter is needed."""
         ...
 

@@ -66,7 +66,7 @@ class ReviewQueue:
         """The rows of all fish that a verdict names; `{"id": ..., "gone": true}` for lost fish."""
         rows: list[dict[str, Any]] = []
         for run, recorder in enumerate(self._recorders):
-            _, _, named = recorder.said()
+            _, _, named = recorder.snapshot()
             rows += self._rows(run, named) if named else []
         return rows
 
@@ -128,7 +128,7 @@ class ReviewQueue:
         self, run: int, wanted: set[int] | None = None
     ) -> Iterator[tuple[Fish, dict[str, Any]]]:
         """The fish of a run as this reader sees them, with their rows."""
-        report, reviews, _ = self._recorder(run).said()
+        report, reviews, _ = self._recorder(run).snapshot()
         placed = replace(self.placed[run], report=report)
         for fish in report.fish:
             track_id = fish.estimate.track_id

@@ -162,7 +162,7 @@ class VerdictRecorder:
         number = last_of(verdicts, self._reviewer, self._reading)
         return None if number is None else verdicts[number - 1]
 
-    def said(self) -> tuple[RunReport, dict[int, Review], set[int]]:
+    def snapshot(self) -> tuple[RunReport, dict[int, Review], set[int]]:
         """The present fish, their reviews, and the ids of all fish that any verdict names."""
         with self._lock:
             verdicts = read_verdicts(self._database)

@@ -111,7 +111,7 @@ class WatchServer(TokenServer):
             )
         keys = ("what", "name", "said_by")
         what, name, said_by = (str(submitted.get(key) or "") for key in keys)
-        return json_response({"name": self._state.hauls.tell(what, name, said_by=said_by)})
+        return json_response({"name": self._state.hauls.mark(what, name, said_by=said_by)})
 
     def _latest_picture(self) -> bytes:
         """The latest measured frame as JPEG; empty before the first."""

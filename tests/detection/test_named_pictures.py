@@ -59,7 +59,7 @@ def test_tables_of_a_spreadsheet_are_refused_clearly(tmp_path, text, expected):
 def test_pictures_of_one_fish_have_its_id_and_the_largest_thing_is_the_fish(tmp_path):
     finder = NamedPictures(ids_file(tmp_path), TwoThings())
     assert finder.open_ids is None
-    assert not finder.gives_masks
+    assert not finder.has_masks
     found = [finder.detect(frame_of(name)) for name in ("a.jpg", "b.jpg", "c.jpg")]
     assert [one.source_id for [one] in found] == [7, 7, 2]
     np.testing.assert_array_equal(found[0][0].bbox_xyxy_px, [2, 3, 28, 15])

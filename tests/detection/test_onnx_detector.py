@@ -268,7 +268,7 @@ def test_the_fish_of_a_model_with_masks_need_no_segmenter(tmp_path: Path):
     model = write_model(tmp_path / "model.onnx", mask_outputs("yolo-seg", filled))
     settings = DetectFishSettings(detector=str(model), onnx_layout="yolo-seg")
     finder = TrackedFish(open_detector(settings), TrackFishSettings(min_track_frames=1))
-    assert finder.gives_masks
+    assert finder.has_masks
     node = CropFish(CropFishSettings(), camera=None, finder=finder)
     [crop] = [one for one in node.step(frame_of(INPUT, INPUT)) if isinstance(one, FishCrop)]
     assert crop.quality.mask_confidence is None

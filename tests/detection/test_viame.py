@@ -29,8 +29,8 @@ def test_polygons_are_masks_and_other_boxes_are_left_to_the_segmenter():
     expected[3:5, 3:5] = False
     np.testing.assert_array_equal(first.mask, expected)
     assert second.mask is None
-    assert not fish.gives_masks
-    assert AnnotatedFish(boxes=parse_viame(drawn, PATH), masks=None).gives_masks
+    assert not fish.has_masks
+    assert AnnotatedFish(boxes=parse_viame(drawn, PATH), masks=None).has_masks
 
 
 def test_tracks_keep_their_ids_and_track_0_gets_a_free_one():

@@ -29,12 +29,12 @@ class Learnt(Setup):
         crops: object,
         forms: CandidateShapes,
         *,
-        suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+        is_enough: Callable[[CandidateShapes], bool] = lambda stocks: False,
         progress: object = None,
     ) -> CandidateShapes:
-        """The first stage where that suffices."""
+        """The first stage if that is enough."""
         first, second = self.stages
-        return first if suffices(first) else second
+        return first if is_enough(first) else second
 
 
 def learnt_shape(breadth: float = 0.0) -> CandidateShapes:

@@ -49,13 +49,13 @@ def test_a_run_that_is_told_of_hauls(tmp_path: Path):
     store = LengthStore(tmp_path, FACTS)
     log = HaulLog(store, HaulsSettings(), frames_lost=lambda: 0)
     with pytest.raises(UserError, match="begin one first"):
-        log.tell("end", said_by="Ada")
+        log.mark("end", said_by="Ada")
     told = {60: ("start", "north"), 240: ("end", ""), 300: ("start", "")}
     names: list[str] = []
     for second in range(0, 601, 5):
         log.take_frame(second * SECOND)
         if second in told:
-            names.append(log.tell(*told[second], said_by="Ada"))
+            names.append(log.mark(*told[second], said_by="Ada"))
     current = log.current()
     log.finish()
     for track_id, time_s in enumerate((30, 120, 200, 400), start=1):
@@ -82,7 +82,7 @@ def test_a_haul_that_is_begun_again_has_only_its_own_times(tmp_path: Path):
     for second in range(0, 601, 5):
         log.take_frame(second * SECOND)
         if second in told:
-            log.tell(*told[second], said_by="Ada")
+            log.mark(*told[second], said_by="Ada")
     log.finish()
     store.close()
     efforts = {one.haul: one for one in read_effort(store.path, [])}

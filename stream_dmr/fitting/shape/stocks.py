@@ -140,7 +140,7 @@ def learn_stocks(
     settings: FitMeshSettings,
     *,
     plane_normal: Float[np.ndarray, "3"],
-    suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+    is_enough: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of, the largest first; None if there are no fish.
@@ -155,7 +155,7 @@ def learn_stocks(
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
     stocks = _shapes_of(groups)
-    if suffices(stocks):
+    if is_enough(stocks):
         return stocks
     groups = learner.reassigned(groups)
     progress(f"{len(groups)} stocks")
@@ -306,13 +306,13 @@ def learn_shapes(
     *,
     calibration: Calibration | None,
     species: SpeciesSettings | None = None,
-    suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+    is_enough: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of; None if none of them is seen whole.
 
     `crops` in the order of their capture; some crops of each fish that are far apart are fitted,
-    with each of the `forms` until one is chosen. `suffices`: see `learn_stocks`.
+    with each of the `forms` until one is chosen. `is_enough`: see `learn_stocks`.
     """
     tracks = TrackFitter(
         template,
@@ -339,5 +339,5 @@ def learn_shapes(
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
     return learn_stocks(
-        template, forms, fish, settings, plane_normal=normal, suffices=suffices, progress=progress
+        template, forms, fish, settings, plane_normal=normal, is_enough=is_enough, progress=progress
     )
