@@ -101,6 +101,7 @@ def read_scene(folder: Path) -> FilmedScene:
         [
             Sighting(replace(crop, image=None, timestamp_ns=_capture_ns(number)), None)
             for crop in crop_fish.step(frame)
+            if isinstance(crop, FishCrop)
         ]
         for number, frame in enumerate(reader.source, start=1)
     ]

@@ -49,6 +49,8 @@ def crops_of(
     for frame in source:
         labels = masks.labels(frame.frame_index, width=source.width, height=source.height)
         for crop in node.step(frame) if labels is not None else []:
+            if not isinstance(crop, FishCrop):  # a track has ended
+                continue
             x, y = frame_from_crop_map(crop.crop_camera, frame_camera=crop.frame_camera)
             grey = (labels.ids == crop.track_id) * np.uint8(255)
             truth = cv2.remap(grey, x, y, cv2.INTER_LINEAR) > 127

@@ -27,7 +27,7 @@ from benchmarks.segmentation.tracking_metrics import score
 from stream_dmr.camera import Camera
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.geometry import box_iou
-from stream_dmr.messages import Frame
+from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.simulation.film import film
@@ -132,7 +132,8 @@ def follow(shots: Iterable[Shot], *, camera: Camera | None) -> Outcome:
     for index, shot in enumerate(shots, 1):
         frame = Frame(frame_index=index, timestamp_ns=index, image=shot.image, source="")
         truth.append(shot.boxes)
-        found.append({crop.track_id: crop.bbox_xyxy_px for crop in node.step(frame)})
+        crops = (crop for crop in node.step(frame) if isinstance(crop, FishCrop))
+        found.append({crop.track_id: crop.bbox_xyxy_px for crop in crops})
     scores = score(truth, found)
     shown = shown_fish(truth, found)
     return Outcome(
@@ -189,7 +190,8 @@ def count_ids(video: Path) -> str:
             break
         num_frames += 1
         frame = Frame(frame_index=num_frames, timestamp_ns=num_frames, image=image, source="")
-        frames.update(crop.track_id for crop in node.step(frame))
+        found = node.step(frame)
+        frames.update(crop.track_id for crop in found if isinstance(crop, FishCrop))
     long = sum(count >= _LONG_FRAMES for count in frames.values())
     return (
         f"{video.name}: {num_frames} frames, {frames.total() / max(num_frames, 1):.1f} fish in a "
