@@ -28,7 +28,12 @@ from stream_dmr.segmentation.crop_geometry import (
     touches_border,
     visible_bbox,
 )
-from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter, resize
+from stream_dmr.segmentation.segmenter import (
+    SegmentedFish,
+    Segmenter,
+    mirrored_probability,
+    resize,
+)
 from stream_dmr.settings import Settings
 
 _PictureSize = Annotated[int, Field(ge=64, le=1024, multiple_of=SIZE_MULTIPLE_PX)]
@@ -53,7 +58,8 @@ class CropFishSettings(Settings):
         default=[128],
         min_length=1,
         description="widths of the pictures of a crop that the segmenter sees, multiples of 32 px, "
-        "those that the frame has; the mean counts. Stills: [128, 192, 256]",
+        "those that the frame has; of several it sees the mirrored pictures too, and the mean "
+        "counts. Stills: [128, 192, 256]",
     )
     second_look: bool = Field(
         default=False,
@@ -200,23 +206,22 @@ def _segment(
 ) -> MaskedCrop:
     """The crop around a box, with the mask that a segmenter finds in it at once."""
     crop_camera = view.camera_around(bbox_xyxy_px)
-    pictures, looks = _looks(view, bbox_xyxy_px, crop_camera, segmenter)
+    image, probability, ends = _look(view, bbox_xyxy_px, crop_camera, segmenter)
     x, y = frame_from_crop_map(crop_camera, frame_camera=view.camera)
     height, width = view.shape
     is_in_frame = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    probability = np.mean([look.probability for look in looks], axis=0) * is_in_frame
+    probability = probability * is_in_frame
     # Area of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map.
     areas = np.abs(_slope(x.T).T * _slope(y) - _slope(x) * _slope(y.T).T)
     min_area_px = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=min_area_px)
-    ends = looks[-1].ends
     unknown = None if ends is None else beyond_head(mask, ends)
     if unknown is not None:
         mask = clean_mask(mask & ~unknown, min_area_px=min_area_px)
     inside = np.round(np.column_stack([x[mask], y[mask]]))  # the frame pixels of the mask's
     low, high = inside.min(axis=0, initial=np.inf), inside.max(axis=0, initial=-np.inf)
     return MaskedCrop(
-        image=resize(pictures[-1], crop_camera.width),
+        image=image,
         crop_camera=crop_camera,
         mask=mask,
         area_px=float(areas[mask].sum()),
@@ -260,21 +265,29 @@ def beyond_head(mask: Bool[np.ndarray, "S S"], ends: FishEnds) -> Bool[np.ndarra
     return unknown
 
 
-def _looks(
+def _look(
     view: FrameView,
     bbox_xyxy_px: Float[np.ndarray, "4"],
     crop_camera: Camera,
     segmenter: Segmenter,
-) -> tuple[list[UInt8[np.ndarray, "_ _ 3"]], list[SegmentedFish]]:
-    """The pictures of a crop for the segmenter, and its results in the crop's pixels."""
-    side_px = crop_camera.width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
-    pictures, found = [], []
-    for size_px in picture_sizes(side_px, view.settings.segmenter_sizes_px):
+) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"], FishEnds | None]:
+    """The finest picture of a crop, with its ends, and the mean probability of all its pictures.
+
+    Mirrored pictures are segmented a little differently, so their mean is better
+    (docs/research/real-pictures.md).
+    """
+    width, sizes_px = crop_camera.width, view.settings.segmenter_sizes_px
+    side_px = width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
+    pictures, looks, mirrored = [], list[SegmentedFish](), []
+    for size_px in picture_sizes(side_px, sizes_px):
         cameras = {"crop_camera": crop_camera.resized(size_px), "frame_camera": view.camera}
         pictures += resample([Layer(view.image)], **cameras)
         box = box_in_crop(bbox_xyxy_px, **cameras)
-        found.append(segmenter.segment(pictures[-1], box).resized(crop_camera.width))
-    return pictures, found
+        looks.append(segmenter.segment(pictures[-1], box).resized(width))
+        if len(sizes_px) > 1:
+            mirrored.append(resize(mirrored_probability(segmenter, pictures[-1], box), width))
+    probability = np.mean([*(look.probability for look in looks), *mirrored], axis=0)
+    return resize(pictures[-1], width), probability, looks[-1].ends
 
 
 def picture_sizes(side_px: float, sizes_px: Sequence[int]) -> list[int]:

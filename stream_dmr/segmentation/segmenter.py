@@ -54,3 +54,15 @@ class Segmenter(Protocol):
     ) -> SegmentedFish:
         """The fish in a box, half-open in pixels of the crop `image` (BGR)."""
         ...
+
+
+def mirrored_probability(
+    segmenter: Segmenter,
+    image: UInt8[np.ndarray, "S S 3"],
+    bbox_xyxy_px: Float[np.ndarray, "4"],
+) -> Float32[np.ndarray, "S S"]:
+    """The probability that a segmenter finds in the mirrored image, mirrored back."""
+    x0, y0, x1, y1 = bbox_xyxy_px
+    box = np.array([len(image) - x1, y0, len(image) - x0, y1])
+    found = segmenter.segment(np.ascontiguousarray(image[:, ::-1]), box)
+    return np.ascontiguousarray(found.probability[:, ::-1])

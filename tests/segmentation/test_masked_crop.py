@@ -27,7 +27,16 @@ class Painter:
         return SegmentedFish(probability=image[..., 0].astype(np.float32) / 255, ends=None)
 
 
-def segmented(picture, box, camera, *, may_be_no_fish=False, **knobs):
+class OneSided(Painter):
+    """A segmenter that overlooks what is on the left of a picture."""
+
+    def segment(self, image, bbox_xyxy_px):
+        found = super().segment(image, bbox_xyxy_px)
+        found.probability[:, : len(image) // 3] = 0
+        return found
+
+
+def segmented(picture, box, camera, *, may_be_no_fish=False, painter=None, **knobs):
     detection = Detection(
         source_id=1,
         bbox_xyxy_px=np.array(box, np.float64),
@@ -35,7 +44,7 @@ def segmented(picture, box, camera, *, may_be_no_fish=False, **knobs):
         visible_fraction=1.0,
         may_be_no_fish=may_be_no_fish,
     )
-    painter = Painter()
+    painter = painter or Painter()
     crop = crop_fish(
         frame_of(np.repeat(picture[..., None], 3, axis=2)),
         detection,
@@ -121,6 +130,23 @@ def test_a_segmenter_sees_no_more_pixels_than_the_frame_has(side_px, seen_px):
     assert crop.quality.mask_area_px == pytest.approx(side_px * (side_px // 4), rel=0.06)
     both, either = crop.mask & coarse.mask, crop.mask | coarse.mask
     assert both.sum() > 0.95 * either.sum()
+
+
+def test_of_several_sizes_left_and_right_are_seen_alike():
+    camera = Camera.nominal(width=640, height=480)
+    picture = np.zeros((480, 640), np.uint8)
+    cv2.ellipse(picture, (300, 240), (120, 40), 10, 0, 360, 255, -1)
+    crops = [
+        segmented(
+            image, box, camera, painter=OneSided(), segmenter_sizes_px=[128, 192], second_look=True
+        )[0]
+        for image, box in (
+            (picture, [178, 190, 422, 290]),
+            (picture[:, ::-1], [218, 190, 462, 290]),
+        )
+    ]
+    np.testing.assert_array_equal(crops[0].mask, crops[1].mask[:, ::-1])
+    assert crops[0].quality.mask_confidence == pytest.approx(crops[1].quality.mask_confidence)
 
 
 def test_a_fish_that_no_crop_shows_whole_touches_the_border():
