@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.detection.picture_views import find_in_still
+from stream_dmr.detection.picture_views import find_both_ways, find_in_still
 from stream_dmr.messages import FishCrop
 from stream_dmr.tracking.finder import share_inside, without_repeats
 from tests.support.frames import frame_of
@@ -93,6 +93,32 @@ def test_large_and_small_fish_of_a_still_are_found_whole_and_once(left, length, 
     boxes = sorted(one.bbox_xyxy_px.tolist() for one in found)
     expected = [[left, 80, right, 120]] + [[10, 150, 10 + neighbour, 160]] * (neighbour > 0)
     np.testing.assert_allclose(boxes, sorted(expected))
+
+
+class _LeftEyed:
+    """Boxes of white rectangles in the left half of a picture, with a score of 0.9."""
+
+    refused: Mapping[str, int] = {}
+
+    def find(self, frame):
+        image = frame.image.copy()
+        image[:, image.shape[1] // 2 :] = 0
+        return _Boxes(0.9).find(frame_of(image))
+
+
+@given(st.integers(0, 60), st.integers(20, 100))
+def test_what_only_one_of_two_mirrored_pictures_shows_has_half_of_its_score(left, length):
+    picture = np.zeros((200, 320, 3), np.uint8)
+    picture[80:120, left : left + length] = 255
+    seen = find_both_ways(_LeftEyed(), frame_of(picture))
+    mirrored = find_both_ways(_LeftEyed(), frame_of(picture[:, ::-1]))
+    for candidate, other in zip(seen, mirrored, strict=True):
+        x0, y0, x1, y1 = candidate.bbox_xyxy_px
+        np.testing.assert_allclose(other.bbox_xyxy_px, [320 - x1, y0, 320 - x0, y1])
+        assert candidate.score == other.score == pytest.approx(0.45)
+    [both] = find_both_ways(_Boxes(0.9), frame_of(picture))
+    np.testing.assert_allclose(both.bbox_xyxy_px, [left, 80, left + length, 120])
+    assert both.score == pytest.approx(0.9)
 
 
 class _Boxes:
