@@ -164,7 +164,11 @@ class Export:
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
         frames, edits = FramesTable(make_folder(out)), self._reviewed.edits
         edited, finished = self._reviewed.estimates(), list[LengthEstimate]()
+        # Of edited fish in one frame: last, since threads recorded its messages in any order.
+        waiting: list[LengthEstimate] = []
         for message, _ in self._reviewed.decoded([LocalizedFish, LengthEstimate]):
+            while waiting and waiting[0].frame_index < message.frame_index:
+                frames.write(make_record(waiting.pop(0), RecordingSettings()))
             if isinstance(message, LengthEstimate):
                 if message.track_id in edited or message.track_id in edits.merged:
                     continue
@@ -172,7 +176,9 @@ class Export:
             frames.write(make_record(message, RecordingSettings()))
             running = edited.get(message.track_id) if isinstance(message, LocalizedFish) else None
             if running is not None:
-                frames.write(make_record(running[message.frame_index], RecordingSettings()))
+                waiting.append(running[message.frame_index])
+        for estimate in waiting:
+            frames.write(make_record(estimate, RecordingSettings()))
         frames.close()
         fish = [] if self._database is None else self._fish
         kept = {caught.estimate.track_id: caught.estimate for caught in fish}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.recording.reading import open_recordings
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.edits import ReviewedMessages
@@ -120,6 +120,33 @@ def test_tables_are_of_the_reviewed_fish(out: Path, exported: Path):
         int(row["track_id"]) for row in rows(exported / "frames.csv") if row["accepted"] == "true"
     )
     assert used == {fish: one.frames_used for fish, one in stored.items() if one.frames_used}
+
+
+def test_the_rows_of_a_frame_do_not_depend_on_which_stage_recorded_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out = measure(tmp_path)
+    queue = ReviewQueue([open_report(out)], reviewer="Ada")
+    submit(queue, "split", 1, frame_index=3)
+    queue.close()
+    decoded, tables = ReviewedMessages.decoded, []
+    for has_places_first in (True, False):
+
+        def reordered(self: ReviewedMessages, kinds, first=has_places_first):
+            def order(entry):
+                message, _ = entry
+                is_later = isinstance(message, LengthEstimate)
+                return message.timestamp_ns, is_later if first else (message.track_id, is_later)
+
+            return sorted(decoded(self, kinds), key=order)
+
+        monkeypatch.setattr(ReviewedMessages, "decoded", reordered)
+        options = {"--out": str(tmp_path / f"exports-{has_places_first}"), "--tables": "csv"}
+        assert invoke(f"export {out}", options).code == 0
+        tables.append(rows(Path(options["--out"]) / "frames.csv"))
+    assert tables[0] == tables[1]
+    frames = [int(row["frame_index"]) for row in tables[0]]
+    assert len(frames) > len(set(frames))
 
 
 def test_a_fish_that_was_added_has_the_species_and_the_fate_that_a_reviewer_says(exported: Path):
