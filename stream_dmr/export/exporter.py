@@ -164,12 +164,13 @@ class Export:
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
         frames, edits = FramesTable(make_folder(out)), self._reviewed.edits
         edited, finished = self._reviewed.estimates(), list[LengthEstimate]()
-        # Of edited fish in one frame: last, since threads recorded its messages in any order.
+        # Of edited fish, until their frame is over: threads may record places before estimates of
+        # earlier frames, but estimates always in the same order.
         waiting: list[LengthEstimate] = []
         for message, _ in self._reviewed.decoded([LocalizedFish, LengthEstimate]):
-            while waiting and waiting[0].frame_index < message.frame_index:
-                frames.write(make_record(waiting.pop(0), RecordingSettings()))
             if isinstance(message, LengthEstimate):
+                while waiting and waiting[0].frame_index < message.frame_index:
+                    frames.write(make_record(waiting.pop(0), RecordingSettings()))
                 if message.track_id in edited or message.track_id in edits.merged:
                     continue
                 finished += [message] if message.is_final else []

@@ -136,7 +136,7 @@ def test_the_rows_of_a_frame_do_not_depend_on_which_stage_recorded_first(
             def order(entry):
                 message, _ = entry
                 is_later = isinstance(message, LengthEstimate)
-                return message.timestamp_ns, is_later if first else (message.track_id, is_later)
+                return is_later if first else (message.timestamp_ns, message.track_id, is_later)
 
             return sorted(decoded(self, kinds), key=order)
 
