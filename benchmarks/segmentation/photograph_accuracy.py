@@ -11,6 +11,7 @@ how many are.
 
 import argparse
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.segmentation.crop import mask_confidence, picture_sizes
-from stream_dmr.segmentation.segmenter import mirrored_probability, resize
+from stream_dmr.segmentation.segmenter import resize, segment_both_ways
 from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.training.annotated_images import read_annotated_images
 from stream_dmr.training.samples import crop_affine
@@ -72,13 +73,12 @@ def judge(
     ious, claims, found = [], [], []
     for image, truth, box in crops:
         whole = len(image)
-        looks = []
-        for px in picture_sizes(whole, sizes):
-            picture, in_picture = resize(image, px), box * px / whole
-            looks.append(network.segment(picture, in_picture).probability)
-            if len(sizes) > 1:  # as stills are
-                looks.append(mirrored_probability(network, picture, in_picture))
-        probability = np.mean([resize(look, whole) for look in looks], axis=0)
+        segment = partial(segment_both_ways, network) if len(sizes) > 1 else network.segment
+        looks = [
+            segment(resize(image, px), box * px / whole).resized(whole).probability
+            for px in picture_sizes(whole, sizes)
+        ]
+        probability = np.mean(looks, axis=0)
         mask = probability > 0.5
         ious.append(np.count_nonzero(mask & truth) / max(np.count_nonzero(mask | truth), 1))
         claims.append(mask_confidence(probability, mask))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import cv2
@@ -31,8 +32,8 @@ from stream_dmr.segmentation.crop_geometry import (
 from stream_dmr.segmentation.segmenter import (
     SegmentedFish,
     Segmenter,
-    mirrored_probability,
     resize,
+    segment_both_ways,
 )
 from stream_dmr.settings import Settings
 
@@ -271,22 +272,17 @@ def _look(
     crop_camera: Camera,
     segmenter: Segmenter,
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"], FishEnds | None]:
-    """The finest picture of a crop, with its ends, and the mean probability of all its pictures.
-
-    Mirrored pictures are segmented a little differently, so their mean is better
-    (docs/research/real-pictures.md).
-    """
+    """The finest picture of a crop, with its ends, and the mean probability of all its pictures."""
     width, sizes_px = crop_camera.width, view.settings.segmenter_sizes_px
     side_px = width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
-    pictures, looks, mirrored = [], list[SegmentedFish](), []
+    segment = partial(segment_both_ways, segmenter) if len(sizes_px) > 1 else segmenter.segment
+    pictures, looks = [], list[SegmentedFish]()
     for size_px in picture_sizes(side_px, sizes_px):
         cameras = {"crop_camera": crop_camera.resized(size_px), "frame_camera": view.camera}
         pictures += resample([Layer(view.image)], **cameras)
         box = box_in_crop(bbox_xyxy_px, **cameras)
-        looks.append(segmenter.segment(pictures[-1], box).resized(width))
-        if len(sizes_px) > 1:
-            mirrored.append(resize(mirrored_probability(segmenter, pictures[-1], box), width))
-    probability = np.mean([*(look.probability for look in looks), *mirrored], axis=0)
+        looks.append(segment(pictures[-1], box).resized(width))
+    probability = np.mean([look.probability for look in looks], axis=0)
     return resize(pictures[-1], width), probability, looks[-1].ends
 
 

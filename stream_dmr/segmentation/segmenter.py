@@ -4,7 +4,7 @@ A segmenter sees a picture of the crop, not the frame. A crop is free of lens di
 pixel map to the frame is in one place (`crop_geometry`), so that a segmenter needs no camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -56,13 +56,18 @@ class Segmenter(Protocol):
         ...
 
 
-def mirrored_probability(
+def segment_both_ways(
     segmenter: Segmenter,
     image: UInt8[np.ndarray, "S S 3"],
     bbox_xyxy_px: Float[np.ndarray, "4"],
-) -> Float32[np.ndarray, "S S"]:
-    """The probability that a segmenter finds in the mirrored image, mirrored back."""
+) -> SegmentedFish:
+    """The fish in a box, with the mean probability of the image and of the mirrored one.
+
+    Mirrored images are segmented a little differently, so the mean is better
+    (docs/research/real-pictures.md).
+    """
+    found = segmenter.segment(image, bbox_xyxy_px)
     x0, y0, x1, y1 = bbox_xyxy_px
     box = np.array([len(image) - x1, y0, len(image) - x0, y1])
-    found = segmenter.segment(np.ascontiguousarray(image[:, ::-1]), box)
-    return np.ascontiguousarray(found.probability[:, ::-1])
+    mirrored = segmenter.segment(np.ascontiguousarray(image[:, ::-1]), box)
+    return replace(found, probability=(found.probability + mirrored.probability[:, ::-1]) / 2)
