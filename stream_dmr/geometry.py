@@ -1,5 +1,7 @@
 """Polylines, affine maps, boxes and connected components."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
@@ -13,6 +15,14 @@ def arc_lengths(points: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "M"]:
 
 def arc_length(points: Float[np.ndarray, "M D"]) -> float:
     return float(arc_lengths(points)[-1])
+
+
+def points_along(
+    line: Float[np.ndarray, "M D"], shares: Float[np.ndarray, "S"] | Sequence[float]
+) -> Float[np.ndarray, "S D"]:
+    """Points of a polyline at these shares of its length."""
+    arc = arc_lengths(line)
+    return np.column_stack([np.interp(shares, arc / arc[-1], axis) for axis in line.T])
 
 
 def bending_ratio(midline: Float[np.ndarray, "M 3"]) -> float:

@@ -7,22 +7,24 @@ neither the plane nor a fit's slant matters. Its ends are the triangulated head 
 A fit that fails ends short: of a fish seen on edge it leaves out the tail. So the ends of a fit of
 low IoU weigh less, and where the two pictures contradict each other, those that are short do.
 
-A tail that the fish's own body hides is in neither picture, and nothing there contradicts. But the
-mesh of a fit knows how long a fish of this breadth is: a curve that is much shorter is doubted.
+A tail that the fish's own body hides is in neither picture, and nothing there contradicts. But a
+mesh that fits both masks (`stream_dmr.fitting.two_masks`) knows where it hides, and how long a fish
+of this breadth is. `agreed` weighs the two lengths.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.geometry import arc_length, arc_lengths
+from stream_dmr.geometry import arc_length, points_along
 
 _DEGREE = 4  # of the curve: a C, an S and a little more
 _STATIONS = 17
+_SHARES = np.linspace(0, 1, _STATIONS)  # of the midline, at which it is compared
 # Std of a midline in a picture, over its length there: across the body; along it at the ends, whose
 # place is seen, and between them, where a turned body is foreshortened unevenly.
 _ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.005, 0.1
@@ -31,9 +33,9 @@ _ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.005, 0.1
 _MISFIT_STD, _ACROSS_SHARE = 0.03, 0.2
 _SHORT = 0.7  # stds by which a picture may be short at both ends before they weigh less
 _DOUBT = 1.5  # misfit that adds as much to the length's std as the two pictures' errors
-# How far a length is from those of the two meshes, as a log: what is usual, since a fit takes a
-# slant for a size, and the std for each part of it beyond. Chosen on simulated pairs.
-_MESH_USUAL, _MESH_SHARE = 0.05, 0.8
+# Of the common mesh's log length, by 1 - IoU. And of the curve's by how far the two lengths differ,
+# as a log, beyond what is usual. Chosen on simulated pairs.
+_MESH_SHARE, _USUAL, _DIFFERENCE_SHARE = 0.3, 0.02, 3.0
 _RIDGE_STD = 1.0  # of the curve's coefficients, over the length, but for place and direction
 # The same along the first camera's line of sight, which cameras that stand close together hardly
 # see: fish slant by some 17 degrees, and bend in depth as they do across it. Chosen.
@@ -50,8 +52,8 @@ class View(NamedTuple):
     """What one camera saw of a fish at a moment."""
 
     midline_px: Float[np.ndarray, "M 2"]  # from head to tail, frame pixels
+    center_px: Float[np.ndarray, "2"]
     calibration: Calibration
-    length_ratio: float  # of the fit's mesh, over its distance from the camera
     iou: float = 1.0  # of the fit, with its mask
 
 
@@ -61,8 +63,7 @@ class Placed:
 
     midline_mm: Float[np.ndarray, "S 3"]
     length_mm: float
-    # By the two pictures' errors, and by how they contradict each other and their fits' meshes.
-    length_std_mm: float
+    length_std_mm: float  # by the pictures' errors, and by how they contradict each other
     misfit: float  # root mean square of the residuals, in the stds of good fits: 1 is expected
 
 
@@ -88,9 +89,8 @@ def rays_apart(
 def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) -> Placed:
     """Fit a curve to both pictures, from a midline in the first camera's frame (mm)."""
     scale = arc_length(start_mm)
-    places = np.linspace(-1, 1, _STATIONS)
-    basis = np.polynomial.legendre.legvander(places, _DEGREE)
-    start = _at(start_mm, _STATIONS)
+    basis = np.polynomial.legendre.legvander(2 * _SHARES - 1, _DEGREE)
+    start = points_along(start_mm, _SHARES)
     coefficients = np.linalg.lstsq(basis, start, rcond=None)[0].ravel()
     frames = (np.eye(3), np.zeros(3)), second_from_first(*(view.calibration for view in views))
     targets = [_weights(view) for view in views]
@@ -138,35 +138,41 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     J = slopes(residuals, coefficients)
     misfit = float(np.sqrt(np.mean(misses(coefficients, good) ** 2)))
     std_mm = float(np.sqrt(slope @ np.linalg.solve(J.T @ J, slope)))
-    line_mm, length_mm = dense @ coefficients.reshape(-1, 3), float(length(coefficients)[0])
-    meshes_mm = [
-        view.length_ratio * distance_mm(line_mm @ R.T + t)
-        for view, (R, t) in zip(views, frames, strict=True)
-    ]
-    off = abs(float(np.mean(np.log(length_mm / np.array(meshes_mm)))))
-    doubt_mm = _MESH_SHARE * max(off - _MESH_USUAL, 0.0) * length_mm
     return Placed(
-        midline_mm=line_mm,
-        length_mm=length_mm,
-        length_std_mm=float(np.hypot(std_mm * np.hypot(1, misfit / _DOUBT), doubt_mm)),
+        midline_mm=dense @ coefficients.reshape(-1, 3),
+        length_mm=float(length(coefficients)[0]),
+        length_std_mm=std_mm * float(np.hypot(1, misfit / _DOUBT)),
         misfit=misfit,
     )
 
 
-def distance_mm(midline_mm: Float[np.ndarray, "M 3"]) -> float:
-    """How far a midline is from the camera in whose frame it is."""
-    return float(np.linalg.norm(midline_mm.mean(axis=0)))
+def agreed(curve: Placed, mesh_mm: Float[np.ndarray, "M 3"], iou: float) -> Placed:
+    """The curve and the midline of a mesh that fits both masks with an IoU, weighed.
 
-
-def _at(line: Float[np.ndarray, "M D"], num: int) -> Float[np.ndarray, "S D"]:
-    """Points of a polyline at equal parts of its length."""
-    arc = arc_lengths(line)
-    places = np.linspace(0, arc[-1], num)
-    return np.column_stack([np.interp(places, arc, axis) for axis in line.T])
+    The midline of the surer of the two, with the length of both. Their errors are taken to be
+    alike: a mask that lacks an end shortens both.
+    """
+    lengths_mm = np.array([curve.length_mm, arc_length(mesh_mm)])
+    difference = abs(float(np.log(lengths_mm[0] / lengths_mm[1])))
+    doubt = _DIFFERENCE_SHARE * max(difference - _USUAL, 0.0)
+    stds = np.array(
+        [np.hypot(curve.length_std_mm / curve.length_mm, doubt), _MESH_SHARE * (1 - iou)]
+    )
+    weights = np.maximum(stds, 1e-6) ** -2
+    weights /= weights.sum()
+    length_mm = float(np.exp(weights @ np.log(lengths_mm)))
+    line_mm = curve.midline_mm if weights[0] > weights[1] else mesh_mm
+    middle = line_mm.mean(axis=0)
+    return replace(
+        curve,
+        midline_mm=middle + length_mm / arc_length(line_mm) * (line_mm - middle),
+        length_mm=length_mm,
+        length_std_mm=float(weights @ stds) * length_mm,
+    )
 
 
 def _weights(view: View) -> _Target:
-    line = _at(view.midline_px, _STATIONS)
+    line = points_along(view.midline_px, _SHARES)
     length_px = arc_length(view.midline_px)
     along = np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)

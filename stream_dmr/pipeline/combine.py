@@ -15,20 +15,20 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
-from stream_dmr.geometry import arc_length
+from stream_dmr.fitting.two_masks import CommonMesh, Sight, TwoMaskFitter
 from stream_dmr.localization.localize_fish import LocalizeSettings, localize, mask_std_ratio
 from stream_dmr.localization.two_views import (
     View,
-    distance_mm,
+    agreed,
     place_between,
     rays_apart,
     second_from_first,
 )
-from stream_dmr.messages import FittedMesh, LocalizedFish
+from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LocalizedFish
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.session import Setup
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.header import SecondCamera
+from stream_dmr.recording.header import RunHeader, SecondCamera
 from stream_dmr.recording.reading import (
     Recording,
     decoded_messages,
@@ -59,7 +59,7 @@ class FishSightings(NamedTuple):
 
     times_ns: Int[np.ndarray, "T"]
     midlines_px: Float[np.ndarray, "T M 2"]
-    length_ratios: Float[np.ndarray, "T"]  # of the fits' meshes, over their distance
+    centers_px: Float[np.ndarray, "T 2"]
     ious: Float[np.ndarray, "T"]  # of the fits
     length_mm: float
 
@@ -79,11 +79,10 @@ class FishSightings(NamedTuple):
         if max(t1 - t0, t0 - time_ns, time_ns - t1) > _MOST_APART_S * 1e9:
             return None
         share = 0.0 if t1 == t0 else (time_ns - t0) / (t1 - t0)
-        ratios = self.length_ratios
         return View(
             midline_px=(1 - share) * self.midlines_px[before] + share * self.midlines_px[after],
+            center_px=(1 - share) * self.centers_px[before] + share * self.centers_px[after],
             calibration=calibration,
-            length_ratio=float((1 - share) * ratios[before] + share * ratios[after]),
             iou=float(min(self.ious[before], self.ious[after])),
         )
 
@@ -92,22 +91,23 @@ def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[i
     """The tracks of a run by their ids, of the frames that count."""
     times: dict[int, list[int]] = {}
     midlines: dict[int, list[Float[np.ndarray, "M 2"]]] = {}
-    ratios: dict[int, list[float]] = {}
+    centers: dict[int, list[np.ndarray]] = {}
     ious: dict[int, list[float]] = {}
     lengths: dict[int, list[float]] = {}
     for frame in fish:
         if frame.accepted and frame.midline_mm is not None and frame.length_mm is not None:
+            assert frame.keypoints_px is not None, "an accepted fish was fitted"
             midline_px = calibration.camera.project(frame.midline_mm)
             times.setdefault(frame.track_id, []).append(frame.timestamp_ns)
             midlines.setdefault(frame.track_id, []).append(midline_px)
-            ratios.setdefault(frame.track_id, []).append(_length_ratio(frame.midline_mm))
+            centers.setdefault(frame.track_id, []).append(frame.keypoints_px[1])
             ious.setdefault(frame.track_id, []).append(frame.iou or 0.0)
             lengths.setdefault(frame.track_id, []).append(frame.length_mm)
     return {
         track_id: FishSightings(
             times_ns=np.array(times[track_id]),
             midlines_px=np.stack(midlines[track_id]),
-            length_ratios=np.array(ratios[track_id]),
+            centers_px=np.stack(centers[track_id]),
             ious=np.array(ious[track_id]),
             length_mm=float(np.median(lengths[track_id])),
         )
@@ -115,8 +115,57 @@ def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[i
     }
 
 
-def _length_ratio(midline_mm: Float[np.ndarray, "M 3"]) -> float:
-    return arc_length(midline_mm) / distance_mm(midline_mm)
+class RecordedFits:
+    """The crops and fits of a recording, read along with the time and then forgotten."""
+
+    def __init__(self, recording: Recording, of: Topics) -> None:
+        self._messages = decoded_messages(recording, [FishCrop, FittedMesh], of=of)
+        self._crops: dict[tuple[int, int], FishCrop] = {}
+        self._fits: dict[int, list[tuple[FishCrop, FittedShape]]] = {}
+
+    def nearest(self, track_id: int, time_ns: int) -> tuple[FishCrop, FittedShape] | None:
+        """The fit of a fish that is nearest to a time; times must not fall by much.
+
+        None if there is none nearby: removed to free disk space, say.
+        """
+        reach_ns = round(_MOST_APART_S * 1e9)
+        for message, _ in self._messages:
+            if isinstance(message, FishCrop):
+                self._crops[message.frame_index, message.track_id] = message
+            elif isinstance(message, FittedMesh):
+                crop = self._crops.pop((message.frame_index, message.track_id), None)
+                if crop is not None and message.shape is not None:
+                    fits = self._fits.setdefault(message.track_id, [])
+                    fits.append((crop, message.shape))
+                if message.timestamp_ns > time_ns + reach_ns:
+                    break
+        for track, fits in [*self._fits.items()]:
+            self._fits[track] = [
+                fit for fit in fits if fit[0].timestamp_ns > time_ns - 4 * reach_ns
+            ]
+        near = self._fits.get(track_id, [])
+        return min(near, key=lambda fit: abs(fit[0].timestamp_ns - time_ns), default=None)
+
+
+class CommonMeshes:
+    """Fits a mesh to the masks that two runs recorded of a fish."""
+
+    def __init__(self, fitter: TwoMaskFitter, first: RecordedFits, second: RecordedFits) -> None:
+        self._fitter, self._first, self._second = fitter, first, second
+
+    def mesh(self, fish: FittedMesh, other: int, second: View, time_ns: int) -> CommonMesh | None:
+        """The mesh at the time of the first camera's fit; None without masks.
+
+        `other`, `second`, `time_ns`: the fish's id and its view by the second camera, and the time
+        there.
+        """
+        own = self._first.nearest(fish.track_id, fish.timestamp_ns)
+        seen = self._second.nearest(other, time_ns)
+        if own is None or seen is None:
+            return None
+        centers_px = np.stack([second.center_px, seen[1].keypoints_px[1]])
+        rays = second.calibration.camera.back_project(centers_px)
+        return self._fitter.fit(Sight(*own, np.zeros(3)), Sight(*seen, rays[0] - rays[1]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,9 +278,7 @@ def open_second(
         return None
     node = None
     if places_fish:
-        messages = decoded_messages(recording, [LocalizedFish], of=topics)
-        fish = (message for message, _ in messages if isinstance(message, LocalizedFish))
-        node = _localize_by_two(first, fish, header.calibration, setup, observer)
+        node = _localize_by_two(first, recording, topics, header, setup, observer)
         offset_ns = round(node.pairing.offset_s * 1e9)
         ids = {other: first for first, others in node.pairing.ids.items() for other in others}
         camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
@@ -241,17 +288,19 @@ def open_second(
 
 def _localize_by_two(
     first: Recording,
-    second: Iterable[LocalizedFish],
-    other: Calibration | None,
+    second: Recording,
+    topics: Topics,
+    header: RunHeader,
     setup: Setup,
     observer: RunObserver,
 ) -> "LocalizeByTwo":
     """The node that places the fish of two runs. Raises UserError if they saw no fish together.
 
-    `second`: the fish of the other run, `other` its calibration. Fish of the first run are placed
-    by its fits, since a recording that was combined before has them as two cameras placed them.
+    `topics`: of the other run's messages in `second`, with its `header`. Fish of the first run are
+    placed by its fits, since a recording that was combined before has them as two cameras placed
+    them.
     """
-    calibration = setup.calibration
+    calibration, other = setup.calibration, header.calibration
     if calibration is None or other is None:
         raise UserError(
             "expected two runs with --calibration, of the same reference plane; found one without"
@@ -268,7 +317,9 @@ def _localize_by_two(
         localize(mesh, settings=setup.config.localize, calibration=calibration)
         for mesh in messages_of(first, FittedMesh)
     )
-    tracks, others = tracks_of(alone, calibration), tracks_of(second, other)
+    messages = decoded_messages(second, [LocalizedFish], of=topics)
+    seen = (message for message, _ in messages if isinstance(message, LocalizedFish))
+    tracks, others = tracks_of(alone, calibration), tracks_of(seen, other)
     steps_ns = np.concatenate([[], *(np.diff(track.times_ns) for track in tracks.values())])
     pairing = None
     if len(steps_ns) and others:
@@ -290,7 +341,17 @@ def _localize_by_two(
             f"the rays to a fish's ends pass {pairing.apart:.1%} of its length apart, usually "
             f"{_RAYS_USUAL:.1%}: has a camera been moved since its calibration?"
         )
-    return LocalizeByTwo(setup.config.localize, calibration, others, other, pairing)
+    settings, common = setup.config.fit_mesh, None
+    if settings.scans_sizes:  # the paper's solver and blend are left as in the paper
+        fitter = TwoMaskFitter(
+            setup.template,
+            setup.candidates,
+            settings,
+            second_joints=header.template.joints,
+            second_from_first=(R, t),
+        )
+        common = CommonMeshes(fitter, RecordedFits(first, TOPICS), RecordedFits(second, topics))
+    return LocalizeByTwo(setup.config.localize, calibration, others, other, pairing, common)
 
 
 class LocalizeByTwo:
@@ -306,10 +367,12 @@ class LocalizeByTwo:
         second: Mapping[int, FishSightings],
         second_calibration: Calibration,
         pairing: Pairing,
+        common: CommonMeshes | None = None,
     ) -> None:
         self._settings = settings
         self._calibration, self._second_calibration = calibration, second_calibration
         self._second, self.pairing = second, pairing
+        self._common = common
 
     def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
@@ -318,21 +381,28 @@ class LocalizeByTwo:
         if not others or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
         time_ns = mesh.timestamp_ns + round(self.pairing.offset_s * 1e9)
-        views = (self._second[other].at(time_ns, self._second_calibration) for other in others)
-        second = next((view for view in views if view is not None), None)
-        if second is None:
+        views = ((n, self._second[n].at(time_ns, self._second_calibration)) for n in others)
+        other, second = next(((n, view) for n, view in views if view is not None), (None, None))
+        if other is None or second is None:
             return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
+        assert alone.keypoints_px is not None, "a placed fish was fitted"
         first = View(
             midline_px=self._calibration.camera.project(alone.midline_mm),
+            center_px=alone.keypoints_px[1],
             calibration=self._calibration,
-            length_ratio=_length_ratio(alone.midline_mm),
             iou=alone.iou or 0.0,
         )
         placed = place_between((first, second), alone.midline_mm)
         if placed.misfit > _MOST_MISFIT:  # a camera may take the head for the tail
             turned = second._replace(midline_px=second.midline_px[::-1])
-            other = place_between((first, turned), alone.midline_mm)
-            placed = min(placed, other, key=lambda placement: placement.misfit)
+            placed = min(
+                placed,
+                place_between((first, turned), alone.midline_mm),
+                key=lambda placement: placement.misfit,
+            )
+        common = self._common and self._common.mesh(mesh, other, second, time_ns)
+        if common is not None:
+            placed = agreed(placed, common.midline_mm, common.iou)
         line = placed.midline_mm
         part = np.linalg.norm(alone.midline_mm - alone.keypoints_mm[1], axis=1).argmin()
         chord_mm = float(np.linalg.norm(line[0] - line[-1]))

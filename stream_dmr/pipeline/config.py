@@ -368,8 +368,8 @@ _STILLS: dict[str, dict[str, Any]] = {
 # on simulated pairs (docs/two-cameras.md): intervals are still too wide rather than too narrow.
 _BY_TWO: dict[str, dict[str, Any]] = {
     "smooth_length": {
-        "frame_correlation": 0.15,
-        "common_std_ratio": 0.005,
+        "frame_correlation": 0.05,
+        "common_std_ratio": 0.007,
         "upward_share": 0.5,
     },
 }

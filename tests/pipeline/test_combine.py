@@ -226,7 +226,7 @@ def tracks(rng, degrees, offset_s):
             found[fish if found is first_tracks else fish + 10] = FishSightings(
                 times_ns=np.round(clock_s * 1e9).astype(np.int64),
                 midlines_px=np.stack([camera.camera.project(line) for line in lines]),
-                length_ratios=np.full(len(lines), 0.14),
+                centers_px=np.stack([camera.camera.project(line)[4] for line in lines]),
                 ious=np.full(len(lines), 0.95),
                 length_mm=700.0,
             )

@@ -98,9 +98,9 @@ STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
 WARM_DAMPING, COLD_DAMPING = 1e-2, 1e-1
 # The damping is multiplied by these after a refused and an accepted step: raised fast and lowered
 # slowly, as by Press et al., "Numerical Recipes", 3rd ed., sec. 15.5, who have 10 and 0.1.
-_GROWTH, _SHRINK = 10.0, 0.3
+GROWTH, SHRINK = 10.0, 0.3
 # Consecutive steps, each ten times shorter: only pixel noise is left to gain.
-_MAX_REFUSED = 3
+MAX_REFUSED = 3
 
 
 class Minimum(NamedTuple):
@@ -178,7 +178,7 @@ def minimise(
         if gain > 0:
             best, here = trial, there
             loss -= gain
-            damping *= _SHRINK
+            damping *= SHRINK
             num_refused = 0
             num_calm = num_calm + 1 if gain < tolerance else 0
             if num_calm == 2:
@@ -186,9 +186,9 @@ def minimise(
             if iteration < options.iterations:
                 H, g = normal_equations(problem, best, here.rendering)
         else:
-            damping *= _GROWTH
+            damping *= GROWTH
             num_refused += 1
-            if num_refused == _MAX_REFUSED:
+            if num_refused == MAX_REFUSED:
                 return Minimum(best, loss, here.iou, iteration, STUCK, H)
     return Minimum(best, loss, here.iou, options.iterations, EXHAUSTED, H)
 
