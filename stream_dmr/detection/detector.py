@@ -9,10 +9,6 @@ from jaxtyping import Bool, Float
 
 from stream_dmr.messages import Frame
 
-# Least score, 0 to 1, of a box that may be a fish. Nearly all simulated fish have more in most
-# frames, rock, light and plants in none; see docs/research/tracking.md.
-FISH_LIKE = 0.15
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Candidate:

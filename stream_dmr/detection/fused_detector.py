@@ -18,9 +18,9 @@ from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.motion_detector import MotionDetector
-from stream_dmr.detection.picture_views import find_in_view
+from stream_dmr.detection.picture_views import look_closer
 from stream_dmr.detection.still_water import StillWater
-from stream_dmr.geometry import box_iou, fraction_inside, longer_side, whole_pixels
+from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
 
@@ -29,8 +29,6 @@ _MIN_IOU = 0.3  # of a moving blob with the box that scores its looks
 _SURE, _SEEN = 0.6, 0.3
 _MIN_INSIDE = 0.8  # of a piece of a fish, inside the fish's box
 _MIN_WHOLE_IOU = 0.5  # of all pieces together with that box
-# The part of the frame for a closer look: in sizes of the candidate, and at least in px.
-_SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
 
 
 class LookSettings(Settings):
@@ -102,18 +100,8 @@ class FusedDetector:
         ]
 
     def look_closer(self, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
-        """Score from 0 to 1 of a box as a fish, in a picture of its surroundings alone.
-
-        What has less than 20 px in the detector's picture of the whole frame can't be told there.
-        """
-        side = max(_SURROUNDINGS * longer_side(bbox_xyxy_px), _MIN_SURROUNDINGS_PX)
-        middle = (bbox_xyxy_px[:2] + bbox_xyxy_px[2:]) / 2
-        limits = np.array(frame.image.shape[1::-1])
-        low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)
-        left, top = low.tolist()
-        right, bottom = np.minimum(low + round(side), limits).tolist()
-        part = frame.image[top:bottom, left:right]
-        return _looks(bbox_xyxy_px, [*find_in_view(self._looks, frame, part, (left, top))])
+        """Score from 0 to 1 of a box as a fish, from near."""
+        return look_closer(self._looks, frame, bbox_xyxy_px)
 
     def _place(self, candidate: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (candidate.bbox_xyxy_px[:2] + candidate.bbox_xyxy_px[2:]) / 2

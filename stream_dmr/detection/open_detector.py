@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stream_dmr.detection.detector import FISH_LIKE, Detector
+from stream_dmr.detection.detector import Detector
 from stream_dmr.detection.fused_detector import FusedDetector, LookSettings
 from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.detection.network_detectors import OnnxDetector, OnnxSettings, UNetDetector
@@ -15,6 +15,9 @@ from stream_dmr.settings import Settings
 
 _LOOKS_THREADS = 1  # two take 9.6 ms of the cores instead of 5.2, which other stages need
 _LOOKS = WEIGHTS / "fish.onnx"
+# Least score of a box that may be a fish. Nearly all simulated fish have more in most frames; see
+# docs/research/tracking.md.
+_MIN_LOOKS = 0.15
 
 
 class DetectorSettings(Settings):
@@ -67,4 +70,4 @@ def open_detector(settings: DetectFishSettings) -> Detector:
 def _open_looks() -> OnnxDetector:
     """The detector that ships, see docs/model-card.md."""
     settings = OnnxSettings(onnx_layout="yolov5")
-    return OnnxDetector(_LOOKS, settings, min_score=FISH_LIKE, threads=_LOOKS_THREADS)
+    return OnnxDetector(_LOOKS, settings, min_score=_MIN_LOOKS, threads=_LOOKS_THREADS)

@@ -121,7 +121,7 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
     return np.count_nonzero(crop.mask & (seen > 127)) / max(np.count_nonzero(crop.mask), 1)
 
 
-_MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as a look at a frame
+_MAX_AT_ONCE = 2  # closer looks in a frame; each takes as long as four looks at a whole frame
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -183,18 +183,16 @@ class TrackedFish:
         )
 
     def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
-        """Look closer at one moving track that, seen from afar, does not look like a fish."""
+        """Look closer at some of the moving tracks that do not yet count as fish."""
         if not isinstance(self._detector, FusedDetector):
             return
         waiting = [
             track
             for track, seen in self._evidence.items()
-            if seen.has_moved
-            and seen.closer_looks < _MAX_CLOSER_LOOKS
-            and not self._may_count(track)
+            if seen.has_moved and seen.wants_closer_look and not self._may_count(track)
         ]
-        if waiting:
-            track = min(waiting, key=lambda track: self._evidence[track].closer_looks)
+        waiting.sort(key=lambda track: self._evidence[track].closer_looks)
+        for track in waiting[:_MAX_AT_ONCE]:
             looks = self._detector.look_closer(frame, boxes[track])
             self._evidence[track].add_closer_look(looks)
 

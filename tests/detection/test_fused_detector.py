@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.detection.fused_detector import FusedDetector, fuse
 from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
+from stream_dmr.detection.picture_views import look_closer
 from stream_dmr.geometry import fraction_inside
 from stream_dmr.messages import Frame
 from tests.support.frames import frame_of
@@ -80,12 +81,37 @@ class LargeAndBright:
 def test_small_fish_are_told_from_nearby_wherever_they_are(x: int, y: int, side: int):
     image = np.zeros((960, 1280, 3), np.uint8)
     image[y : y + side, x : x + side] = 255
-    detector = FusedDetector(MotionDetector(MotionSettings()), LargeAndBright())
     box = np.array([x, y, x + side, y + side], np.float64)
     assert LargeAndBright().find(frame_of(image)) == []
-    assert detector.look_closer(frame_of(image), box) == 0.8
+    assert look_closer(LargeAndBright(), frame_of(image), box) == pytest.approx(0.8)
     beside = box + (100 if x < 640 else -100)
-    assert detector.look_closer(frame_of(image), beside) == 0.0
+    assert look_closer(LargeAndBright(), frame_of(image), beside) == 0.0
+
+
+class Marked:
+    """Finds the white box of a picture."""
+
+    refused: ClassVar[dict[str, int]] = {}
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        x, y, w, h = cv2.boundingRect(frame.image[..., 0])
+        return [Candidate(bbox_xyxy_px=np.array([x, y, x + w, y + h], float), score=1.0)]
+
+
+@given(
+    st.tuples(st.integers(20, 900), st.integers(20, 900)), st.tuples(*[st.floats(0.01, 0.99)] * 4)
+)
+def test_a_closer_look_shows_the_box_anywhere_in_pictures_of_any_size(
+    shape: tuple[int, int], corners: tuple[float, float, float, float]
+):
+    """Upright and turned: else the box would be found elsewhere, with a score of 0."""
+    height, width = shape
+    x0, x1 = sorted(1 + int(share * (width - 3)) for share in corners[:2])
+    y0, y1 = sorted(1 + int(share * (height - 3)) for share in corners[2:])
+    image = np.zeros((height, width, 3), np.uint8)
+    image[y0 : y1 + 1, x0 : x1 + 1] = 255
+    box = np.array([x0, y0, x1 + 1, y1 + 1], np.float64)
+    assert look_closer(Marked(), frame_of(image), box) == 1.0
 
 
 def at(x0: float, y0: float, x1: float, y1: float) -> Candidate:
