@@ -122,6 +122,7 @@ class RecordedFits:
         self._messages = decoded_messages(recording, [FishCrop, FittedMesh], of=of)
         self._crops: dict[tuple[int, int], FishCrop] = {}
         self._fits: dict[int, list[tuple[FishCrop, FittedShape]]] = {}
+        self._read_ns = -1  # time of the last fit that was read
 
     def nearest(self, track_id: int, time_ns: int) -> tuple[FishCrop, FittedShape] | None:
         """The fit of a fish that is nearest to a time; times must not fall by much.
@@ -129,20 +130,22 @@ class RecordedFits:
         None if there is none nearby: removed to free disk space, say.
         """
         reach_ns = round(_MOST_APART_S * 1e9)
-        for message, _ in self._messages:
+        while self._read_ns <= time_ns + reach_ns and (read := next(self._messages, None)):
+            message, _ = read
             if isinstance(message, FishCrop):
                 self._crops[message.frame_index, message.track_id] = message
             elif isinstance(message, FittedMesh):
+                self._read_ns = message.timestamp_ns
                 crop = self._crops.pop((message.frame_index, message.track_id), None)
                 if crop is not None and message.shape is not None:
                     fits = self._fits.setdefault(message.track_id, [])
                     fits.append((crop, message.shape))
-                if message.timestamp_ns > time_ns + reach_ns:
-                    break
-        for track, fits in [*self._fits.items()]:
-            self._fits[track] = [
-                fit for fit in fits if fit[0].timestamp_ns > time_ns - 4 * reach_ns
-            ]
+        since_ns = time_ns - 4 * reach_ns
+        self._fits = {
+            track: lately
+            for track, fits in self._fits.items()
+            if (lately := [fit for fit in fits if fit[0].timestamp_ns > since_ns])
+        }
         near = self._fits.get(track_id, [])
         return min(near, key=lambda fit: abs(fit[0].timestamp_ns - time_ns), default=None)
 
