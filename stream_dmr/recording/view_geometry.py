@@ -15,7 +15,7 @@ from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.solver.spine import KINDS, deform
-from stream_dmr.geometry import arc_length, arc_lengths
+from stream_dmr.geometry import arc_length, points_along
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
 from stream_dmr.recording.reading import Recording, known_shapes
 from stream_dmr.template.template import Template
@@ -162,9 +162,7 @@ def _stations(
     midline: Float[np.ndarray, "M 3"],
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
     """Points at equal parts of a midline's length, and the directions there."""
-    arc = arc_lengths(midline)
-    places = np.linspace(0, arc[-1], _STATIONS)
-    points = np.stack([np.interp(places, arc, axis) for axis in midline.T], axis=1)
+    points = points_along(midline, np.linspace(0, 1, _STATIONS))
     along = np.gradient(points, axis=0)
     return points, along / np.linalg.norm(along, axis=1, keepdims=True)
 
