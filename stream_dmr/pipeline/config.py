@@ -369,6 +369,7 @@ _STILLS: dict[str, dict[str, Any]] = {
 _BY_TWO: dict[str, dict[str, Any]] = {
     "smooth_length": {
         "frame_correlation": 0.05,
+        "correlation_time_s": 0.13,
         "common_std_ratio": 0.007,
         "upward_share": 0.5,
     },

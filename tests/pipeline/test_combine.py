@@ -187,6 +187,27 @@ def test_a_head_that_one_camera_takes_for_the_tail_changes_no_length(scene, comb
     assert num_accepted > 20
 
 
+def test_a_poor_fit_by_one_camera_counts_where_a_mesh_fits_both_masks(scene, combined, tmp_path):
+    """By a limit that many of these good fits fail; the mesh is held to a limit of its own."""
+    limit = 0.945
+    (tmp_path / "config.toml").write_text(f"[localize]\nmin_iou = {limit}\n")
+    request = ReplayOptions(
+        recordings=[scene / "run"],
+        first="localize",
+        second=scene / SECOND / "run",
+        config=tmp_path / "config.toml",
+        out=tmp_path / "both",
+    )
+    replay(request, stop=threading.Event())
+    fish = [*messages_of(open_recordings([tmp_path / "both"]), LocalizedFish)]
+    poor = [one for one in fish if one.iou is not None and one.iou < limit and one.accepted]
+    assert len(poor) > 2
+    true = {row["track_id"]: float(row["length_mm"]) for row in rows(scene / "truth.csv")}
+    off = [one.length_mm / true[str(one.track_id)] - 1 for one in poor]
+    assert np.abs(off).max() < 0.06
+    assert np.abs(np.mean(off)) < 0.015
+
+
 def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
     result = invoke(f"combine {scene / 'run'} {scene / 'run'} --out {tmp_path / 'same'}")
     assert "two cameras at least 3 degrees apart" in result.error
