@@ -75,6 +75,8 @@ class CropQuality:
     # Change of the fish's length in a box that extends beyond its ends, over its length; None: not
     # looked at.
     length_doubt: float | None = None
+    # Probability that the mask lacks snout or tail, by a network; None: not judged.
+    missing_end: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

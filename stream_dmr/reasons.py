@@ -101,6 +101,12 @@ class Reason(StrEnum):
         "the mask's confidence is below `[localize] min_mask_confidence`",
         "train the network",
     )
+    END_NOT_SEEN = (
+        "end not seen",
+        _FRAME,
+        "the mask seems to lack snout or tail: `[localize] max_missing_end`",
+        "look at the mask: dark ends want light, or draw the box around all of the fish",
+    )
     POOR_FIT = (
         "poor fit",
         _FRAME,

@@ -4,8 +4,9 @@
 
 IMAGES and MASKS as for `photograph_accuracy`. Each source is one run of stills that lie below a far
 camera: with the masks given; with boxes around the fish; with boxes that lack 8 to 20 % at one end;
-and from the pictures alone. Nothing is known of these fish but their masks, so what is compared is
-what own masks change: a fish of 1.00 has the length that it has with its mask given.
+with 5 to 20 % of each fish painted over, and boxes around the rest; and from the pictures alone.
+Nothing is known of these fish but their masks, so what is compared is what own masks change: a fish
+of 1.00 has the length that it has with its mask given.
 """
 
 import argparse
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool
 
 import stream_dmr
-from benchmarks.segmentation.end_accuracy import boxes_of
+from benchmarks.segmentation.end_accuracy import PAINTED, boxes_of, paint_over
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.training.annotated_images import AnnotatedImage, read_annotated_images
@@ -44,6 +45,7 @@ def write_pictures(pictures: list[AnnotatedImage], out: Path) -> list[Fish]:
     lines: dict[str, list[str]] = defaultdict(list)
     (out / "pictures").mkdir(parents=True)
     (out / "masks").mkdir()
+    (out / "painted over").mkdir()
     for number, annotated in enumerate(pictures, 1):
         height, width = annotated.image.shape[:2]
         scale = min(((_SIZE - 2 * _RIM_PX) / [width, height]).min(), _ENLARGED)
@@ -52,17 +54,21 @@ def write_pictures(pictures: list[AnnotatedImage], out: Path) -> list[Fish]:
         size = _SIZE.tolist()
         picture = cv2.warpAffine(annotated.image, affine, size, borderValue=_GROUND)
         labels = np.zeros(_SIZE[::-1], np.uint8)
-        rng = np.random.default_rng(number)
+        rng, painting = np.random.default_rng(number), np.random.default_rng([number, 1])
+        painted = picture
         for mask in annotated.masks:
             if np.count_nonzero(mask) < _MIN_AREA_PX:
                 continue
             moved = cv2.warpAffine(mask.astype(np.float32), affine, size) > 0.5
             fish.append(Fish(number, moved))
             labels[moved] = len(fish)
-            for name, (left, top, right, bottom) in boxes_of(rng, moved).items():
+            boxes, share = boxes_of(rng, moved), painting.uniform(*PAINTED)
+            painted, boxes["painted over"] = paint_over(painting, painted, moved, share)
+            for name, (left, top, right, bottom) in boxes.items():
                 box = f"{left:.1f},{top:.1f},{right - left:.1f},{bottom - top:.1f}"
                 lines[name].append(f"{number},{len(fish)},{box},1,1,1")
         cv2.imwrite(str(out / "pictures" / f"{number:06d}.png"), picture)
+        cv2.imwrite(str(out / "painted over" / f"{number:06d}.png"), painted)
         cv2.imwrite(str(out / "masks" / f"{number:06d}.png"), labels)
     for name, rows in lines.items():
         (out / f"{name}.txt").write_text("\n".join(rows) + "\n")
@@ -116,9 +122,9 @@ def main() -> None:
         out = arguments.out / source
         fish = write_pictures(pictures, out)
         given: dict[int, stream_dmr.FishRow] = {}
-        for by in ("masks", "whole", "lacks an end", "pictures alone"):
+        for by in ("masks", "whole", "lacks an end", "painted over", "pictures alone"):
             run = stream_dmr.measure(
-                out / "pictures",
+                out / ("painted over" if by == "painted over" else "pictures"),
                 out=out / by.replace(" ", "-"),
                 calibration=out / "calibration.yaml",
                 masks=out / "masks" if by == "masks" else None,

@@ -27,10 +27,11 @@ _LYING_END_STD = 0.25  # of both ends' heights together: from stiff to limp is f
 # Relative std of a body form's thickness: thickness over length differs so much among specimens of
 # one species, by how full they are.
 _THICKNESS_STD = 0.3
-# Std of a fish's log length by its mask: by its confidence, and by how much the length changes in a
-# longer box. All frames of a fish share it: a dark tail is dark in all of them. Fitted to
-# photographs that the segmenter never saw; see docs/research/real-pictures.md.
-_MASK_STD, _DOUBT_STD = 0.12, 0.35
+# Std of a fish's log length by its mask: by 1 - its confidence, by how much the length changes in a
+# longer box, and by the square of the probability that it lacks an end; with and without that
+# probability. All frames of a fish share it: a dark tail is dark in all of them. Fitted to
+# photographs that the networks never saw; see docs/research/real-pictures.md.
+_MASK_STDS, _UNJUDGED_MASK_STDS = (0.08, 0.3, 0.12), (0.12, 0.35, 0.0)
 _HEIGHT_ROUNDS = 3  # the height goes with the length, which goes with the height
 
 
@@ -52,6 +53,13 @@ class LocalizeSettings(Settings):
         ge=0,
         le=1,
         description="least mask confidence that counts; given masks have none",
+    )
+    max_missing_end: float = Field(
+        default=0.98,
+        ge=0,
+        le=1,
+        description="likeliest that the mask lacks snout or tail, by the network that judges "
+        "stills, of a frame that counts",
     )
     max_length_std_ratio: float = Field(
         default=0.2, gt=0, description="largest std of a fit's length that counts, over length"
@@ -175,8 +183,10 @@ def mask_std_ratio(quality: CropQuality) -> float:
     """Std of the log length by errors of a found mask at its ends; 0 for a given mask."""
     if quality.mask_confidence is None:
         return 0.0
-    unsure = _MASK_STD * (1 - quality.mask_confidence)
-    return float(np.hypot(unsure, _DOUBT_STD * (quality.length_doubt or 0.0)))
+    missing = quality.missing_end
+    stds = _UNJUDGED_MASK_STDS if missing is None else _MASK_STDS
+    causes = 1 - quality.mask_confidence, quality.length_doubt or 0.0, (missing or 0.0) ** 2
+    return float(np.linalg.norm(np.multiply(stds, causes)))
 
 
 def locate(
@@ -285,6 +295,7 @@ def quality_refusal(
         Reason.MOSTLY_HIDDEN: not quality.visible_fraction >= settings.min_visible_fraction,
         Reason.UNSURE_MASK: quality.mask_confidence is not None
         and not quality.mask_confidence >= settings.min_mask_confidence,
+        Reason.END_NOT_SEEN: not (quality.missing_end or 0.0) <= settings.max_missing_end,
         Reason.POOR_FIT: not shape.iou >= settings.min_iou,
         Reason.UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
     }

@@ -29,6 +29,7 @@ from stream_dmr.segmentation.crop_geometry import (
     touches_border,
     visible_bbox,
 )
+from stream_dmr.segmentation.end_judge import shipped_judge
 from stream_dmr.segmentation.segmenter import (
     SegmentedFish,
     Segmenter,
@@ -65,7 +66,8 @@ class CropFishSettings(Settings):
     second_look: bool = Field(
         default=False,
         description="true: what was found is cut out again as a wider view shows it, and by a box "
-        "that goes on beyond its ends: a detector's box may lack the tail. Stills: true",
+        "that goes on beyond its ends: a detector's box may lack the tail; and a network judges "
+        "whether the mask has both ends. Stills: true",
     )
     segmenter: str = Field(
         default="unet",
@@ -119,6 +121,7 @@ class MaskedCrop:
     unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front, or no fish
     pixel_px: float = 1.0  # frame pixels along a pixel of the mask that `extent` is of
     length_doubt: float | None = None  # see `CropQuality`
+    missing_end: float | None = None  # see `CropQuality`
 
     def touches_border(self, view: FrameView) -> bool:
         """True if the fish may continue beyond the crop or the frame."""
@@ -374,6 +377,8 @@ def crop_fish(
             crop = _doubted(view, crop, segmenter)
         elif settings.second_look:
             crop = _lengthened(view, crop, segmenter)
+        if settings.second_look:
+            crop = replace(crop, missing_end=shipped_judge().missing(crop.image, crop.mask))
     else:
         raise ValueError("expected a detection with a mask or a segmenter, got neither")
     return FishCrop(
@@ -394,6 +399,7 @@ def crop_fish(
             mask_confidence=crop.confidence,
             glare=glare(crop.image, crop.mask),
             length_doubt=crop.length_doubt,
+            missing_end=crop.missing_end,
         ),
         ends=crop.ends,
     )

@@ -14,6 +14,8 @@ from stream_dmr.localization.localize_fish import (
     bow_ratio,
     intersect,
     localize,
+    mask_std_ratio,
+    quality_refusal,
 )
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LossTerms
 from stream_dmr.nodes.localize import Localize
@@ -373,6 +375,25 @@ def test_a_mask_that_is_less_sure_or_longer_in_a_longer_box_gives_a_wider_length
         stds.append(localized(mesh, calibration).shared_std_ratio)
     given, sure, unsure, looked_again, doubted = stds
     assert given < sure < unsure == looked_again < doubted
+
+
+@given(st.floats(0, 1), st.floats(0, 1), st.floats(0, 0.3))
+def test_the_likelier_a_mask_lacks_an_end_the_wider_is_its_length(missing, confidence, doubt):
+    quality = replace(GOOD, mask_confidence=confidence, length_doubt=doubt)
+    ratios = [mask_std_ratio(replace(quality, missing_end=m)) for m in (0.0, missing, 1.0)]
+    assert ratios == sorted(ratios)
+    assert ratios[2] >= 0.12
+    given = replace(quality, mask_confidence=None, missing_end=1.0)
+    assert mask_std_ratio(given) == 0
+
+
+@pytest.mark.parametrize(
+    ("missing", "reason"), [(None, None), (0.97, None), (0.99, Reason.END_NOT_SEEN)]
+)
+def test_a_mask_that_seems_to_lack_an_end_is_refused(missing, reason):
+    quality = replace(GOOD, missing_end=missing)
+    shape = straight_fish(make_calibration()).shape
+    assert quality_refusal(shape, quality, LocalizeSettings()) == reason
 
 
 def lying_fish(calibration, *, length_mm, ends, half_thickness=0.05):

@@ -278,6 +278,7 @@ def test_a_second_look_finds_the_tail_that_a_box_lacks(second_look):
     # Whether it is a fish says the first look.
     assert crop.quality.mask_confidence == pytest.approx(0.9**2.85, abs=0.02)
     assert (crop.quality.length_doubt is None) == (not second_look)
+    assert (crop.quality.missing_end is None) == (not second_look)
 
 
 class Believer(Painter):
