@@ -118,7 +118,7 @@ def _measured(filmed: FilmedScene) -> list[JudgedLength]:
         for number, frame in enumerate(filmed.frames)
         for sighting in frame
     ]
-    template, forms = load_shapes(AUTO)
+    template, forms = load_shapes(AUTO, are_lying=True)
     assert forms is not None
     stocks = learn_shapes(crops, template, forms, config.fit_mesh, calibration=filmed.calibration)
     nodes = Session(

@@ -86,10 +86,15 @@ def learn_template(
     require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
-    mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
+    settings = settings_of(config, header.config_toml, recordings[0])
+    mesh, forms = load_shapes(
+        template,
+        are_lying=settings.localize.rests_on_plane,
+        on_notice=lambda line: warn([line]),
+    )
     forms = forms or mesh_form(mesh)
     setup = Setup(
-        config=settings_of(config, header.config_toml, recordings[0]),
+        config=settings,
         template=mesh,
         candidates=forms,
         calibration=header.calibration,

@@ -227,7 +227,7 @@ def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S
     if forms is None:
         if mesh_fits_fish(seen_whole, setup, observer):
             return setup
-        template, forms = load_shapes(AUTO)
+        template, forms = load_shapes(AUTO, are_lying=setup.config.localize.rests_on_plane)
         assert forms is not None
         setup = replace(setup, template=template)
     return replace(setup, candidates=_learn_and_report(seen_whole, setup, forms, observer))

@@ -214,7 +214,9 @@ def read_inputs(
     if request.template is None:
         template, candidates = header.template, known_shapes(recording)
     else:
-        template, candidates = load_shapes(request.template, on_notice=observer.warn)
+        template, candidates = load_shapes(
+            request.template, are_lying=config.localize.rests_on_plane, on_notice=observer.warn
+        )
     inputs = ReplayInputs(
         config=config,
         template=template,

@@ -154,7 +154,9 @@ def checked_inputs(request: RunOptions) -> Inputs:
     notices: list[str] = []
     if request.overwrite:
         _keep_template(request)
-    template, candidates = load_shapes(request.template, on_notice=notices.append)
+    template, candidates = load_shapes(
+        request.template, are_lying=config.localize.rests_on_plane, on_notice=notices.append
+    )
     require_known_species(config.species)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     if request.key is not None:

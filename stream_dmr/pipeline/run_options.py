@@ -18,7 +18,8 @@ Stage = Literal["crop", "fit", "localize", "smooth"]
 TemplateOption = Annotated[
     str,
     "auto: the shape of the fish themselves. Or the body form that they probably have (halibut, "
-    "cod, salmon, bream, tuna, pike, eel), or a mesh of the species with its TOML beside it.",
+    "cod, salmon, bream, spadefish, tuna, pike, eel), or a mesh of the species with its TOML "
+    "beside it.",
 ]
 ConfigOption = Annotated[Path | None, "A config.toml; left-out settings keep their defaults."]
 KeyOption = Annotated[Path | None, "Device key of `keygen`; signs all that is written."]

@@ -248,8 +248,8 @@ def _measured(
     )
 
 
-# Chosen. The bundled forms have an elongation from 2.4 (bream) to 14 (eel), and a volume from 0.002
-# (eel) to 0.022 (bream) of the length cubed; a sphere has 1 and 0.52.
+# Chosen. The bundled forms have an elongation from 1.6 (spadefish) to 14 (eel), and a volume from
+# 0.002 (eel) to 0.031 (spadefish) of the length cubed; a sphere has 1 and 0.52.
 _MIN_VOLUME, _MAX_VOLUME = 3e-4, 0.1
 _MESH_LENGTH_PX = 1200  # of the side view in which snout and fork are found
 _ENDS = (0.05, 0.10, 0.15)  # of the length: sections that distinguish a head from a tail fin

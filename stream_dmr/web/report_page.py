@@ -210,7 +210,7 @@ def _shape_notes(report: RunReport) -> Iterator[str]:
         return
     if not {shape.name for shape in stocks} <= set(bundled_names()):
         return  # learnt from a mesh of the user's own, which the recording does not have
-    _, forms = load_shapes(AUTO)
+    _, forms = load_shapes(AUTO, are_lying=True)  # all forms
     if forms is not None:
         yield from describe(forms, stocks)
 

@@ -32,6 +32,9 @@ _BASE_FORM = "cod"
 _ALWAYS = np.iinfo(np.int64).min  # the time from which on the body forms are known
 # Odds of the form that the user names, against each other form.
 _NAMED_ODDS = 20.0
+# A form so deep that it looks like a slimmer one if it turns: 72 hanging halibut were learnt as it
+# and became 1 % shorter. Fish that lie don't turn.
+_DEEPEST_FORM = "spadefish"
 
 
 class Choice(NamedTuple):
@@ -134,12 +137,15 @@ class CandidateShapes:
         )
 
 
-def body_forms(template: Template, *, named: str | None = None) -> CandidateShapes:
+def body_forms(template: Template, *, named: str | None, are_lying: bool) -> CandidateShapes:
     """The bundled body forms on one of their meshes; `named` is likelier than the others.
 
-    A fish may still turn out to be of another form: a name is a hint, the masks decide.
+    A fish may still turn out to be of another form: a name is a hint, the masks decide. The deepest
+    form is one of them only if the fish lie, or if it is named.
     """
     names = bundled_names()
+    if not are_lying and named != _DEEPEST_FORM:
+        names.remove(_DEEPEST_FORM)
     odds = np.array([_NAMED_ODDS if name == named else 1.0 for name in names])
     covariance = np.linalg.inv(form_precision())
     forms = [
@@ -150,7 +156,10 @@ def body_forms(template: Template, *, named: str | None = None) -> CandidateShap
 
 
 def load_shapes(
-    name: str, *, on_notice: Callable[[str], None] = lambda notice: None
+    name: str,
+    *,
+    are_lying: bool = False,
+    on_notice: Callable[[str], None] = lambda notice: None,
 ) -> tuple[Template, CandidateShapes | None]:
     """The mesh and the candidate shapes of `--template`.
 
@@ -161,7 +170,7 @@ def load_shapes(
     if name != AUTO and name not in bundled_names():
         return load_template(name, on_notice=on_notice), None
     template = replace(load_template(_BASE_FORM), name=name)
-    return template, body_forms(template, named=None if name == AUTO else name)
+    return template, body_forms(template, named=None if name == AUTO else name, are_lying=are_lying)
 
 
 def mesh_form(template: Template) -> CandidateShapes:

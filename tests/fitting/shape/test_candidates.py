@@ -8,7 +8,6 @@ import pytest
 from stream_dmr.fitting.shape.candidates import (
     CandidateShape,
     CandidateShapes,
-    body_forms,
     describe,
     load_shapes,
     mesh_form,
@@ -19,7 +18,7 @@ from stream_dmr.template.template_file import bundled_names, load_template, save
 from tests.support.recorded_run import header
 from tests.support.shapes import STRAIGHT, fish_template
 
-TEMPLATE, FORMS = load_shapes("auto")
+TEMPLATE, FORMS = load_shapes("auto", are_lying=True)
 
 
 def assert_equal(some: CandidateShapes, other: CandidateShapes) -> None:
@@ -32,6 +31,12 @@ def test_auto_takes_every_body_form_for_as_likely():
     assert [form.name for form in FORMS] == bundled_names()
     np.testing.assert_allclose(FORMS.shares, 1 / len(bundled_names()))
     assert not FORMS.are_learnt
+
+
+def test_the_deepest_form_is_one_of_those_of_lying_fish_or_named():
+    without = [name for name in bundled_names() if name != "spadefish"]
+    for name, expected in (("auto", without), ("cod", without), ("spadefish", bundled_names())):
+        assert [form.name for form in load_shapes(name)[1]] == expected
 
 
 def test_a_named_form_gets_the_largest_share_and_the_others_keep_some():
@@ -78,7 +83,7 @@ def test_a_recording_of_before_has_none():
     ],
 )
 def test_a_stock_is_described_by_how_it_differs_from_its_form(breadth, thickness, words):
-    cod = next(form for form in body_forms(TEMPLATE) if form.name == "cod")
+    cod = next(form for form in FORMS if form.name == "cod")
     coefficients = cod.coefficients.copy()
     coefficients[BREADTH] += breadth
     coefficients[THICKNESS] += thickness
