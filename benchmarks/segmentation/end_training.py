@@ -28,10 +28,7 @@ from stream_dmr.segmentation.unet_segmenter import UNetSegmenter
 from stream_dmr.training.annotated_images import list_images, read_annotated_images, read_image
 from stream_dmr.training.random_fish import PATCH_PX, draw_fish_patch
 
-_LENGTH_PX, _SIZE_PX = (
-    200.0,
-    (352, 224),
-)  # of a fish and its picture, out of which samples are drawn
+_LENGTH_PX, _SIZE_PX = 200.0, (352, 224)  # of a fish, and its picture, to draw samples from
 _DRAWN_FISH = 400
 _SAMPLES = 20  # of each drawn fish; twice as many of a photographed one
 _RECOLOURED = 2  # samples of each end of a segmented mask
