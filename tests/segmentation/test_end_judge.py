@@ -10,10 +10,10 @@ from stream_dmr.segmentation.end_judge import HEIGHT_PX, WIDTH_PX, end_picture, 
 from stream_dmr.training.random_fish import draw_fish_patch
 
 
-def spindle(degrees, length_px, size_px=240):
+def spindle(degrees, length_px, size_px=240, slenderness=4):
     """A mask of that length, four times as long as broad, and a picture that is brighter in it."""
     mask = np.zeros((size_px, size_px), np.uint8)
-    axes = round(length_px / 2), round(length_px / 8)
+    axes = round(length_px / 2), round(length_px / 2 / slenderness)
     cv2.ellipse(mask, (size_px // 2, size_px // 2), axes, degrees, 0, 360, 1, -1)
     image = np.full((size_px, size_px, 3), 60, np.uint8)
     image[mask > 0] = 180
@@ -53,7 +53,9 @@ def drawn(count=24):
 def test_masks_that_lack_an_end_are_told_from_whole_ones():
     judge = shipped_judge()
     found = [[judge.missing(image, m) for m in (mask, cut)] for image, mask, cut in drawn()]
-    whole, cut = np.array(found).T
+    judged = [pair for pair in found if None not in pair]  # the others are too thin
+    assert len(judged) > 12
+    whole, cut = np.array(judged).T
     assert np.mean(cut[:, None] > whole) > 0.85  # the area under the ROC curve; 0.5 by chance
 
 
@@ -62,6 +64,11 @@ def test_which_way_a_fish_lies_does_not_matter():
     for image, mask, _ in drawn(4):
         turned = judge.missing(np.rot90(image).copy(), np.rot90(mask).copy())
         assert turned == pytest.approx(judge.missing(image, mask), abs=0.1)
+
+
+def test_fish_thinner_than_those_it_learnt_from_are_not_judged():
+    found = [shipped_judge().missing(*spindle(20, 200, slenderness=k)) for k in (6, 7, 10, 14)]
+    assert [one is None for one in found] == [False, False, True, True]
 
 
 def test_nothing_of_a_fish_lacks_an_end():
