@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Int32, Real, UInt8
 
 
 def arc_lengths(points: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "M"]:
@@ -41,6 +41,11 @@ def transformed(
 ) -> Float[np.ndarray, "*N 2"]:
     """Points (x, y) mapped as `cv2.warpAffine` maps pixels."""
     return points @ affine[:, :2].T + affine[:, 2]
+
+
+def long_axis(points: Real[np.ndarray, "N 2"]) -> Float[np.ndarray, "2"]:
+    """Unit vector along the larger principal axis of points, of either sign."""
+    return np.linalg.eigh(np.cov(points.T))[1][:, 1]
 
 
 def components(

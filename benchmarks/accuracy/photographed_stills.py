@@ -19,7 +19,13 @@ import numpy as np
 from jaxtyping import Bool
 
 import stream_dmr
-from benchmarks.segmentation.end_accuracy import PAINTED, boxes_of, paint_over
+from benchmarks.segmentation.end_accuracy import (
+    MIN_AREA_PX,
+    PAINTED,
+    boxes_of,
+    paint_over,
+    reaches_rim,
+)
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.training.annotated_images import AnnotatedImage, read_annotated_images
@@ -29,7 +35,6 @@ _DISTANCE_MM = 10_240.0  # 1 px is 1 mm, and fish are thin before it
 _RIM_PX = 20
 _ENLARGED = 2.0  # at most
 _GROUND = (96, 96, 96)  # around pictures of another shape
-_MIN_AREA_PX = 400
 
 
 class Fish(NamedTuple):
@@ -57,7 +62,7 @@ def write_pictures(pictures: list[AnnotatedImage], out: Path) -> list[Fish]:
         rng, painting = np.random.default_rng(number), np.random.default_rng([number, 1])
         painted = picture
         for mask in annotated.masks:
-            if np.count_nonzero(mask) < _MIN_AREA_PX:
+            if np.count_nonzero(mask) < MIN_AREA_PX:
                 continue
             moved = cv2.warpAffine(mask.astype(np.float32), affine, size) > 0.5
             fish.append(Fish(number, moved))
@@ -111,8 +116,9 @@ def main() -> None:
     arguments = parser.parse_args()
     sources: dict[str, list[AnnotatedImage]] = defaultdict(list)
     for annotated in read_annotated_images(arguments.images, arguments.masks):
-        rims = [m[edge] for m in annotated.masks for edge in (0, -1, (..., 0), (..., -1))]
-        if not np.concatenate(rims).any():  # where a fish is cut off, the picture says nothing
+        if not any(
+            map(reaches_rim, annotated.masks)
+        ):  # where a fish is cut off, the picture says nothing
             sources[annotated.path.stem.split("-")[0]].append(annotated)
     print(
         "| source | by | fish | measured | mean | rms | beyond 5 % | worst | held | width | none |"

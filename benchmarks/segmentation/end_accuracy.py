@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.camera import Camera
+from stream_dmr.geometry import long_axis
 from stream_dmr.localization.localize_fish import LocalizeSettings, mask_std_ratio
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.networks.unet_interface import SIZES_PX
@@ -31,7 +32,7 @@ _SPREAD = 0.02  # of a box's edges, over its sides
 _LOST = (0.08, 0.2)  # of a box's longer side
 PAINTED = (0.05, 0.2)  # of the fish's length
 _MAX_MISSING = LocalizeSettings().max_missing_end
-_MIN_AREA_PX = 400
+MIN_AREA_PX = 400
 
 
 class Cut(NamedTuple):
@@ -76,7 +77,7 @@ def measure(
     layer = crop.mask.view(np.uint8) * np.uint8(255)
     mask = cv2.warpAffine(layer, to_frame[:2], (width, height)) > 127
     iou = np.count_nonzero(mask & truth) / max(np.count_nonzero(mask | truth), 1)
-    along = long_axis(truth)
+    along = long_axis(np.argwhere(truth))
     found, true = (np.ptp(np.argwhere(one) @ along) if one.any() else 0 for one in (mask, truth))
     is_refused = (crop.quality.missing_end or 0.0) > _MAX_MISSING
     return Cut(iou, found / true - 1, mask_std_ratio(crop.quality), is_refused)
@@ -84,13 +85,11 @@ def measure(
 
 def is_whole(truth: Bool[np.ndarray, "H W"]) -> bool:
     """True if the picture shows all of a fish, and not too small."""
-    rim = np.concatenate([truth[[0, -1]].ravel(), truth[:, [0, -1]].ravel()])
-    return not rim.any() and np.count_nonzero(truth) >= _MIN_AREA_PX
+    return not reaches_rim(truth) and np.count_nonzero(truth) >= MIN_AREA_PX
 
 
-def long_axis(truth: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "2"]:
-    """Of the second moments: row, column."""
-    return np.linalg.eigh(np.cov(np.argwhere(truth).T))[1][:, 1]
+def reaches_rim(mask: Bool[np.ndarray, "H W"]) -> bool:
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def paint_over(
@@ -101,7 +100,7 @@ def paint_over(
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Float[np.ndarray, "4"]]:
     """A picture in which a share of a fish's length is surroundings, and a box of the rest."""
     points = np.argwhere(truth)
-    far = points @ long_axis(truth) * rng.choice([-1, 1])
+    far = points @ long_axis(points) * rng.choice([-1, 1])
     gone = np.zeros(truth.shape, np.uint8)
     gone[tuple(points[far > far.max() - share * np.ptp(far)].T)] = 1
     rest = truth & (gone == 0)

@@ -40,7 +40,7 @@ _Mask = Bool[np.ndarray, "H W"]
 
 
 class Fish(NamedTuple):
-    """A photographed fish, lying across a picture of its own."""
+    """A photographed or drawn fish, lying across a picture of its own."""
 
     image: _Image
     mask: _Mask
@@ -221,10 +221,8 @@ class EndNet(nn.Module):
         spread = colours.std((1, 2, 3), keepdim=True) + 0.05
         colours = (colours - colours.mean((2, 3), keepdim=True)) / spread
         features = self.features(torch.cat([colours, mask], 1))
-        mean, most = (
-            F.adaptive_avg_pool2d(features, (1, 4)),
-            F.adaptive_max_pool2d(features, (1, 4)),
-        )
+        mean = F.adaptive_avg_pool2d(features, (1, 4))
+        most = F.adaptive_max_pool2d(features, (1, 4))
         pooled = torch.cat([mean.flatten(1), most.flatten(1)], 1)
         return self.head(F.dropout(pooled, 0.3, self.training))
 

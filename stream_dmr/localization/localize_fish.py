@@ -58,8 +58,8 @@ class LocalizeSettings(Settings):
         default=0.98,
         ge=0,
         le=1,
-        description="likeliest that the mask lacks snout or tail, by the network that judges "
-        "stills, of a frame that counts",
+        description="greatest probability that snout or tail is missing from the mask of a frame "
+        "that counts; judged in stills",
     )
     max_length_std_ratio: float = Field(
         default=0.2, gt=0, description="largest std of a fit's length that counts, over length"

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
 from stream_dmr.camera import Camera
-from stream_dmr.geometry import box_iou
+from stream_dmr.geometry import box_iou, long_axis
 from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.networks.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.segmentation.crop_geometry import (
@@ -29,7 +29,7 @@ from stream_dmr.segmentation.crop_geometry import (
     touches_border,
     visible_bbox,
 )
-from stream_dmr.segmentation.end_judge import shipped_judge
+from stream_dmr.segmentation.end_judge import missing_end
 from stream_dmr.segmentation.segmenter import (
     SegmentedFish,
     Segmenter,
@@ -121,7 +121,6 @@ class MaskedCrop:
     unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front, or no fish
     pixel_px: float = 1.0  # frame pixels along a pixel of the mask that `extent` is of
     length_doubt: float | None = None  # see `CropQuality`
-    missing_end: float | None = None  # see `CropQuality`
 
     def touches_border(self, view: FrameView) -> bool:
         """True if the fish may continue beyond the crop or the frame."""
@@ -377,10 +376,9 @@ def crop_fish(
             crop = _doubted(view, crop, segmenter)
         elif settings.second_look:
             crop = _lengthened(view, crop, segmenter)
-        if settings.second_look:
-            crop = replace(crop, missing_end=shipped_judge().missing(crop.image, crop.mask))
     else:
         raise ValueError("expected a detection with a mask or a segmenter, got neither")
+    is_judged = detection.mask is None and settings.second_look
     return FishCrop(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,
@@ -399,7 +397,7 @@ def crop_fish(
             mask_confidence=crop.confidence,
             glare=glare(crop.image, crop.mask),
             length_doubt=crop.length_doubt,
-            missing_end=crop.missing_end,
+            missing_end=missing_end(crop.image, crop.mask) if is_judged else None,
         ),
         ends=crop.ends,
     )
@@ -468,5 +466,5 @@ def _end_to_end_px(view: FrameView, *crops: MaskedCrop) -> list[float]:
     for crop in crops:
         x, y = frame_from_crop_map(crop.crop_camera, frame_camera=view.camera)
         found.append(np.column_stack([x[crop.mask], y[crop.mask]]).astype(np.float64))
-    _, axes = np.linalg.eigh(np.cov(found[0].T))
-    return [float(np.ptp(points @ axes[:, 1])) + 1 for points in found]
+    along = long_axis(found[0])
+    return [float(np.ptp(points @ along)) + 1 for points in found]

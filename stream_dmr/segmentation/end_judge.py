@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stream_dmr.geometry import long_axis
 from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.networks.unet_interface import WEIGHTS
 
@@ -24,34 +25,26 @@ _THINNEST = 0.09
 _FINE = 1.4  # picture pixels to one of the network's, from which on they are averaged
 
 
-class EndJudge:
-    """The network, once opened; keeps no state of any fish."""
+def missing_end(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float | None:
+    """Probability that the mask of a crop (BGR) lacks some of its fish.
 
-    def __init__(self, session: Any) -> None:
-        """`session` is onnxruntime's, of a network by `benchmarks.segmentation.end_training`."""
-        self._session = session
-
-    def missing(
-        self, image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]
-    ) -> float | None:
-        """Probability that the mask of a crop (BGR) lacks some of its fish.
-
-        1 if it is empty; None if it is thinner than the fish that the network knows.
-        """
-        if np.count_nonzero(mask) < _FEWEST:
-            return 1.0
-        seen = end_picture(image, mask)
-        if np.count_nonzero(seen[..., 3] > 127) < _THINNEST * _LENGTH_PX**2:
-            return None
-        # Each end to the right, and each upside down.
-        looks = np.stack([seen, seen[:, ::-1], seen[::-1], seen[::-1, ::-1]])
-        log_odds = self._session.run(None, {"ends": looks})[0][:, 0].reshape(2, 2).mean(axis=0)
-        return float(1 / (1 + np.exp(-log_odds.max())))
+    1 if it is empty; None if it is thinner than the fish that the network knows.
+    """
+    if np.count_nonzero(mask) < _FEWEST:
+        return 1.0
+    seen = end_picture(image, mask)
+    if np.count_nonzero(seen[..., 3] > 127) < _THINNEST * _LENGTH_PX**2:
+        return None
+    # Each end to the right, and each upside down.
+    looks = np.stack([seen, seen[:, ::-1], seen[::-1], seen[::-1, ::-1]])
+    log_odds = _network().run(None, {"ends": looks})[0][:, 0].reshape(2, 2).mean(axis=0)
+    return float(1 / (1 + np.exp(-log_odds.max())))
 
 
 @cache
-def shipped_judge() -> EndJudge:
-    return EndJudge(open_session(WEIGHTS / "ends.onnx", threads=1))
+def _network() -> Any:
+    """The session of what `benchmarks.segmentation.end_training` wrote."""
+    return open_session(WEIGHTS / "ends.onnx", threads=1)
 
 
 def end_picture(
@@ -77,7 +70,7 @@ def upright(
     """
     rows, columns = np.nonzero(mask)
     points = np.column_stack([columns, rows]).astype(np.float64)
-    along = np.linalg.eigh(np.cov(points.T))[1][:, 1]
+    along = long_axis(points)
     along *= 1.0 if along[0] >= 0 else -1.0
     axes = np.stack([along, [-along[1], along[0]]])
     low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)

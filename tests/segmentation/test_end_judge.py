@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.segmentation.end_judge import HEIGHT_PX, WIDTH_PX, end_picture, shipped_judge
+from stream_dmr.segmentation.end_judge import HEIGHT_PX, WIDTH_PX, end_picture, missing_end
 from stream_dmr.training.random_fish import draw_fish_patch
 
 
@@ -51,8 +51,7 @@ def drawn(count=24):
 
 
 def test_masks_that_lack_an_end_are_told_from_whole_ones():
-    judge = shipped_judge()
-    found = [[judge.missing(image, m) for m in (mask, cut)] for image, mask, cut in drawn()]
+    found = [[missing_end(image, m) for m in (mask, cut)] for image, mask, cut in drawn()]
     judged = [pair for pair in found if None not in pair]  # the others are too thin
     assert len(judged) > 12
     whole, cut = np.array(judged).T
@@ -60,17 +59,16 @@ def test_masks_that_lack_an_end_are_told_from_whole_ones():
 
 
 def test_which_way_a_fish_lies_does_not_matter():
-    judge = shipped_judge()
     for image, mask, _ in drawn(4):
-        turned = judge.missing(np.rot90(image).copy(), np.rot90(mask).copy())
-        assert turned == pytest.approx(judge.missing(image, mask), abs=0.1)
+        turned = missing_end(np.rot90(image).copy(), np.rot90(mask).copy())
+        assert turned == pytest.approx(missing_end(image, mask), abs=0.1)
 
 
 def test_fish_thinner_than_those_it_learnt_from_are_not_judged():
-    found = [shipped_judge().missing(*spindle(20, 200, slenderness=k)) for k in (6, 7, 10, 14)]
+    found = [missing_end(*spindle(20, 200, slenderness=k)) for k in (6, 7, 10, 14)]
     assert [one is None for one in found] == [False, False, True, True]
 
 
 def test_nothing_of_a_fish_lacks_an_end():
     image = np.zeros((64, 64, 3), np.uint8)
-    assert shipped_judge().missing(image, np.zeros((64, 64), bool)) == 1.0
+    assert missing_end(image, np.zeros((64, 64), bool)) == 1.0
