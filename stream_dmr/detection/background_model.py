@@ -65,10 +65,13 @@ class CameraMotion:
             return None
         affine = estimate_similarity(before, picture, is_background=is_background)
         if affine is None:
+            if self._explained <= _MIN_EXPLAINED * self._changed:  # not found moving so far
+                self._rest_frames = _REST_FRAMES
             return None
         moved = warp(before, affine)
         changed, remaining = cv2.absdiff(before, picture), cv2.absdiff(moved, picture)
-        self._add_explained(changed[is_background].mean(), remaining[is_background].mean())
+        mask = is_background.view(np.uint8)
+        self._add_explained(cv2.mean(changed, mask)[0], cv2.mean(remaining, mask)[0])
         self._add_unmoved(_cell_means(changed), _cell_means(cv2.absdiff(before, moved)))
         is_explained = self._explained > _MIN_EXPLAINED * self._changed
         is_at_rest = np.mean(self._unmoved > 0.5 * self._predicted) > _MAX_UNMOVED_CELLS
@@ -106,7 +109,7 @@ def estimate_similarity(
         _MAX_FEATURES,
         _FEATURE_QUALITY,
         _FEATURE_DISTANCE_PX,
-        mask=is_background.astype(np.uint8),
+        mask=is_background.view(np.uint8),
     )
     if points is None or len(points) < _MIN_FEATURES:
         return None
@@ -142,6 +145,7 @@ def compose(second: Affine, first: Affine) -> Affine:
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
 _REGION = 1 / 8  # of the longer side, over which the colour covariance is taken
 _STRIDE = 3  # px: the statistics of regions use every third pixel
+_GRID = np.s_[::_STRIDE, ::_STRIDE]
 _SENSOR_STD = 2.0  # grey levels; least difference of two pictures of the same thing
 _MAX_INLIER_DISTANCE = 9.0  # squared distance; pixels above it are left out of the covariance
 _TRIMMING_CORRECTION = 1.1  # full over trimmed second moments of a normal distribution
@@ -152,6 +156,7 @@ _COVARIANCE_FRAMES = 10  # over which a region's covariance is learnt
 _MAX_VARIANCE_RATIO = np.float32(8)
 # Constants of compiled code; other types would make its sums float64.
 _ONE, _TWO = np.float32(1), np.float32(2)
+_SENSOR_VARIANCE = np.float32(_SENSOR_STD**2)
 _NUM_CHANNELS = np.float32(3)  # the mean of a squared Mahalanobis distance of colours
 
 
@@ -161,7 +166,7 @@ class BackgroundModel:
     It is initialised from one picture, which may contain fish.
     """
 
-    def __init__(self, picture: Float32[np.ndarray, "3 H W"], *, memory_frames: float) -> None:
+    def __init__(self, picture: UInt8[np.ndarray, "3 H W"], *, memory_frames: float) -> None:
         height, width = picture.shape[1:]
         self._memory_frames = memory_frames
         self._size = (width, height)
@@ -170,12 +175,11 @@ class BackgroundModel:
         self.mean = np.stack([_wide_median(plane, window_px) for plane in picture])
         self._age = np.zeros((height, width), np.float32)  # frames learnt; -1: not yet seen
         self._variance_ratio = np.ones((height, width), np.float32)  # over that of the region
-        self._light = np.zeros_like(self.mean)  # difference of the picture's regions to the mean
-        weight = np.ones((height, width), np.float32)
+        weight = np.ones_like(self._age[_GRID])
         for _ in range(_NUM_TRIMMINGS):
-            self._light, self._moments = self._region_statistics(picture, weight)
-            self._precision = _precision(self._moments, self._size)
-            weight = (self.distance(picture) < _MAX_INLIER_DISTANCE).astype(np.float32)
+            light, self._moments = self._region_statistics(picture, weight)
+            self._regions = _regions(light, self._moments, width)
+            weight = (self.distance(picture)[_GRID] < _MAX_INLIER_DISTANCE).astype(np.float32)
         # Pixels that are not foreign are background as they are, with their texture.
         is_background = self.distance(picture) < 3 * _MAX_INLIER_DISTANCE
         np.copyto(self.mean, picture, where=is_background)
@@ -188,79 +192,86 @@ class BackgroundModel:
         self._variance_ratio = warp(self._variance_ratio, affine)
         self._age = cv2.warpAffine(self._age, affine, self._size, borderValue=-1)
 
-    def fill_unseen(self, picture: Float32[np.ndarray, "3 H W"]) -> None:
+    def fill_unseen(self, picture: UInt8[np.ndarray, "3 H W"]) -> None:
         """Take a picture as the mean in places that were not in view before."""
         is_unseen = self._age < 0
-        np.copyto(self.mean, picture, where=is_unseen)
-        self._age[is_unseen] = 0
+        if is_unseen.any():
+            np.copyto(self.mean, picture, where=is_unseen)
+            self._age[is_unseen] = 0
 
-    def distance(self, picture: Float32[np.ndarray, "3 H W"]) -> Float32[np.ndarray, "H W"]:
+    def distance(self, picture: UInt8[np.ndarray, "3 H W"]) -> Float32[np.ndarray, "H W"]:
         """Squared Mahalanobis distance of each pixel from the background; about 3 on average."""
-        return _distance(picture, self.mean, self._light, self._precision, self._variance_ratio)
+        return _distance(picture, self.mean, self._regions, self._variance_ratio)
 
     def learn(
         self,
-        picture: Float32[np.ndarray, "3 H W"],
+        picture: UInt8[np.ndarray, "3 H W"],
         distance: Float32[np.ndarray, "H W"],
         rate: Float32[np.ndarray, "H W"],
     ) -> None:
         """Update the model by a picture and its `distance`; `rate` from 0 (not) to 1 (full)."""
-        inlier_rate = rate * (distance < _MAX_INLIER_DISTANCE)
-        self._light, moments = self._region_statistics(picture, inlier_rate)
+        inlier_rate = rate[_GRID] * (distance[_GRID] < _MAX_INLIER_DISTANCE)
+        light, moments = self._region_statistics(picture, inlier_rate)
         self._moments += (_TRIMMING_CORRECTION * moments - self._moments) / _COVARIANCE_FRAMES
-        self._precision = _precision(self._moments, self._size)
+        self._regions = _regions(light, self._moments, self._size[0])
         min_speed = np.float32(1 / self._memory_frames)
         _learn(picture, distance, rate, min_speed, self.mean, self._variance_ratio, self._age)
 
     def _region_statistics(
-        self, picture: Float32[np.ndarray, "3 H W"], weight: Float32[np.ndarray, "H W"]
-    ) -> tuple[Float32[np.ndarray, "3 H W"], Float32[np.ndarray, "6 h w"]]:
-        """By region: the change of light, and second moments BB, GG, RR, BG, BR, GR without it."""
-        weight = weight[::_STRIDE, ::_STRIDE]
+        self, picture: UInt8[np.ndarray, "3 H W"], weight: Float32[np.ndarray, "h w"]
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "2 h w 3"]]:
+        """By region: the change of light, and second moments BB, GG, RR; BG, BR, GR without it."""
+        weight = cv2.merge([weight] * 3)  # OpenCV is thrice as fast with three layers in one
         total = self._box_mean(weight) + np.float32(1e-3)
-        change = picture[:, ::_STRIDE, ::_STRIDE] - self.mean[:, ::_STRIDE, ::_STRIDE]
-        light = np.stack([self._box_mean(weight * plane) / total for plane in change])
-        b, g, r = change - light
-        products = [b * b, g * g, r * r, b * g, b * r, g * r]
-        moments = np.stack([self._box_mean(weight * product) / total for product in products])
-        return _enlarged(light, self._size), moments
+        change = cv2.merge(list(picture[:, *_GRID] - self.mean[:, *_GRID]))
+        light = self._box_mean(weight * change) / total
+        b, g, r = cv2.split(change - light)
+        products = [cv2.merge([b * b, g * g, r * r]), cv2.merge([b * g, b * r, g * r])]
+        return light, np.stack([self._box_mean(weight * part) / total for part in products])
 
-    def _box_mean(self, layer: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        return cv2.blur(layer, (self._region_px, self._region_px), borderType=cv2.BORDER_REFLECT)
+    def _box_mean(self, layers: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+        return cv2.blur(layers, (self._region_px, self._region_px), borderType=cv2.BORDER_REFLECT)
 
 
-def _wide_median(plane: Float32[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
+def _wide_median(plane: UInt8[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
     """Medians over windows of four times `window_px`, from a picture of a quarter of the size."""
-    small = cv2.resize(plane.astype(np.uint8), None, fx=0.25, fy=0.25)
+    small = cv2.resize(plane, None, fx=0.25, fy=0.25)
     return cv2.resize(cv2.medianBlur(small, window_px), plane.shape[::-1]).astype(np.float32)
 
 
 @compiled
 def _distance(
-    picture: Float32[np.ndarray, "3 H W"],
+    picture: UInt8[np.ndarray, "3 H W"],
     mean: Float32[np.ndarray, "3 H W"],
-    light: Float32[np.ndarray, "3 H W"],
-    precision: Float32[np.ndarray, "6 H W"],
+    regions: Float32[np.ndarray, "h 9 W"],
     variance_ratio: Float32[np.ndarray, "H W"],
 ) -> Float32[np.ndarray, "H W"]:
-    """Pixel by pixel d' S^-1 d / ratio with d = picture - mean - light; S^-1 as BB, GG, ..."""
-    squared = np.empty_like(variance_ratio)
-    for i in range(variance_ratio.shape[0]):
-        for j in range(variance_ratio.shape[1]):
-            b = picture[0, i, j] - mean[0, i, j] - light[0, i, j]
-            g = picture[1, i, j] - mean[1, i, j] - light[1, i, j]
-            r = picture[2, i, j] - mean[2, i, j] - light[2, i, j]
-            along_b = precision[0, i, j] * b
-            along_b += _TWO * (precision[3, i, j] * g + precision[4, i, j] * r)
-            along_g = precision[1, i, j] * g + _TWO * precision[5, i, j] * r
-            total = b * along_b + g * along_g + precision[2, i, j] * r * r
+    """Pixel by pixel d' S^-1 d / ratio with d = picture - mean - light, by rows of `_regions`."""
+    squared, last = np.empty_like(variance_ratio), len(regions) - 1
+    for i in range(squared.shape[0]):
+        y = min(max((i + 0.5) * len(regions) / squared.shape[0] - 0.5, 0.0), last)
+        above, below = regions[int(y)], regions[min(int(y) + 1, last)]
+        v = np.float32(y - int(y))  # linear between the rows above and below
+        u = _ONE - v
+        for j in range(squared.shape[1]):
+            b = picture[0, i, j] - mean[0, i, j] - (u * above[0, j] + v * below[0, j])
+            g = picture[1, i, j] - mean[1, i, j] - (u * above[1, j] + v * below[1, j])
+            r = picture[2, i, j] - mean[2, i, j] - (u * above[2, j] + v * below[2, j])
+            bb = u * above[3, j] + v * below[3, j]
+            gg = u * above[4, j] + v * below[4, j]
+            rr = u * above[5, j] + v * below[5, j]
+            bg = u * above[6, j] + v * below[6, j]
+            br = u * above[7, j] + v * below[7, j]
+            gr = u * above[8, j] + v * below[8, j]
+            along_b = bb * b + _TWO * (bg * g + br * r)
+            total = b * along_b + g * (gg * g + _TWO * gr * r) + rr * r * r
             squared[i, j] = total / variance_ratio[i, j]
     return squared
 
 
 @compiled
 def _learn(
-    picture: Float32[np.ndarray, "3 H W"],
+    picture: UInt8[np.ndarray, "3 H W"],
     distance: Float32[np.ndarray, "H W"],
     rate: Float32[np.ndarray, "H W"],
     min_speed: np.float32,
@@ -284,23 +295,33 @@ def _learn(
                 age[i, j] += _ONE
 
 
-def _precision(
-    moments: Float32[np.ndarray, "6 h w"], size: tuple[int, int]
-) -> Float32[np.ndarray, "6 H W"]:
-    """The inverse covariance of every pixel: BB, GG, RR, BG, BR, GR; adjugate over determinant."""
-    a, b, c, d, e, f = moments
-    a, b, c = (variance + np.float32(_SENSOR_STD**2) for variance in (a, b, c))
-    adjugate = [b * c - f * f, a * c - e * e, a * b - d * d]
-    adjugate += [e * f - c * d, d * f - b * e, d * e - a * f]
-    determinant = a * adjugate[0] + d * adjugate[3] + e * adjugate[4]
-    return _enlarged(np.stack(adjugate) / determinant, size)
+def _regions(
+    light: Float32[np.ndarray, "h w 3"], moments: Float32[np.ndarray, "2 h w 3"], width: int
+) -> Float32[np.ndarray, "h 9 W"]:
+    """Rows of the change of light, and of the inverse covariance: BB, GG, RR, BG, BR, GR.
+
+    They are as wide as the picture, but as many as the regions; `_distance` has what lies between.
+    """
+    rows = _with_precision(light, moments).reshape(-1, light.shape[1])
+    return cv2.resize(rows, (width, len(rows))).reshape(-1, 9, width)
 
 
-def _enlarged(
-    layers: Float32[np.ndarray, "N h w"], size: tuple[int, int]
-) -> Float32[np.ndarray, "N H W"]:
-    """Layers interpolated to a size (width, height)."""
-    enlarged = np.empty((len(layers), size[1], size[0]), np.float32)
-    for layer, target in zip(layers, enlarged, strict=True):
-        cv2.resize(layer, size, dst=target)
-    return enlarged
+@compiled
+def _with_precision(
+    light: Float32[np.ndarray, "h w 3"], moments: Float32[np.ndarray, "2 h w 3"]
+) -> Float32[np.ndarray, "h 9 w"]:
+    """Light, and the inverse covariance: adjugate over determinant."""
+    layers = np.empty((light.shape[0], 9, light.shape[1]), np.float32)
+    for i in range(light.shape[0]):
+        for j in range(light.shape[1]):
+            layers[i, 0, j], layers[i, 1, j], layers[i, 2, j] = light[i, j]
+            a, b, c = moments[0, i, j]
+            d, e, f = moments[1, i, j]
+            a, b, c = a + _SENSOR_VARIANCE, b + _SENSOR_VARIANCE, c + _SENSOR_VARIANCE
+            adjugate = (b * c - f * f, a * c - e * e, a * b - d * d)
+            others = (e * f - c * d, d * f - b * e, d * e - a * f)
+            determinant = a * adjugate[0] + d * others[0] + e * others[1]
+            for k in range(3):
+                layers[i, 3 + k, j] = adjugate[k] / determinant
+                layers[i, 6 + k, j] = others[k] / determinant
+    return layers

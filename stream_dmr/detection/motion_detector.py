@@ -136,7 +136,8 @@ def _refusal(
 _MIN_CHANGE = 8  # grey levels between two pictures; less is noise
 _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
-_FOREIGN_RATE = 0.02  # of moving pixels: errors of the model must fade at last
+# By the levels of a mask of moving pixels: errors of the model must fade there at last.
+_RATES = np.array([1] + [0.02] * 255, np.float32)
 _NEAR_THRESHOLD_RATIO = 0.65  # of the threshold, for pixels near pixels above it
 _NEAR_PX = 11  # diameter of "near"
 _IDENTITY = np.eye(2, 3)
@@ -211,8 +212,7 @@ class MotionDetector:
         distance = background.distance(picture)
         foreign = _find_foreign(distance, self._settings.motion_min_distance)
         still = _find_still(foreign, aligned, self._before)
-        near_foreign = cv2.dilate(foreign, _disc(5)) > 0
-        rate = np.where(near_foreign, _FOREIGN_RATE, 1.0).astype(np.float32)
+        rate = cv2.LUT(cv2.dilate(foreign, _disc(5)), _RATES)
         rate[still] = _STILL_RATE
         background.learn(picture, distance, rate)
         self._before = aligned
@@ -329,8 +329,8 @@ def _count_changed(
                             break
 
 
-def _planes(picture: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "3 h w"]:
-    return np.array(cv2.split(picture), np.float32)
+def _planes(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "3 h w"]:
+    return np.array(cv2.split(picture))
 
 
 def _shrink(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:

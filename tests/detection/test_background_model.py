@@ -1,5 +1,6 @@
 """The background model: what it learns, and which colours it finds foreign."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,17 +13,21 @@ EVERYWHERE = np.ones((HEIGHT, WIDTH), np.float32)
 seeds = st.integers(0, 99)
 
 
+def picture_of(planes: np.ndarray) -> np.ndarray:
+    return planes.round().clip(0, 255).astype(np.uint8)
+
+
 def noise(seed: int, *, level: float = 120.0, std: float = 6.0) -> np.ndarray:
     """A calm picture with noise of this standard deviation in each channel."""
     rng = np.random.default_rng(seed)
-    return (level + std * rng.standard_normal((3, HEIGHT, WIDTH))).astype(np.float32)
+    return picture_of(level + std * rng.standard_normal((3, HEIGHT, WIDTH)))
 
 
 def waves(seed: int) -> np.ndarray:
     """A picture that varies along one line of colours, dark green to white."""
     heights = np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH))
     line = np.array([20.0, 16.0, 8.0])[:, None, None]
-    return (100 + heights * line).astype(np.float32)
+    return picture_of(100 + heights * line)
 
 
 def learnt(pictures: list[np.ndarray], *, memory_frames: float = 1e6) -> BackgroundModel:
@@ -39,6 +44,41 @@ def test_the_distance_of_the_background_averages_the_number_of_channels(seed: in
     distance = model.distance(noise(10 * seed + 99))
     assert (distance >= 0).all()
     assert distance.mean() == pytest.approx(3, rel=0.35)
+
+
+@settings(max_examples=5)
+@given(seeds)
+def test_the_distance_is_by_the_inverse_covariance_of_regions_enlarged_to_the_picture(seed: int):
+    model = BackgroundModel(picture_of(np.full((3, HEIGHT, WIDTH), 120.0)), memory_frames=1e6)
+    seen, picture = noise(2 * seed, std=4), noise(2 * seed + 1, std=4)
+    before = model.distance(seen)
+    model.learn(seen, before, EVERYWHERE)
+
+    weight = 1.0 * (before < 9)[::3, ::3]
+    change = seen[:, ::3, ::3] - 120.0
+    light = np.array([region_means(plane, weight) for plane in change])
+    rest = change - light
+    covariance = 4.0 * np.eye(3) + np.zeros((*weight.shape, 3, 3))
+    for i, j in np.ndindex(3, 3):
+        covariance[..., i, j] += 0.11 * region_means(rest[i] * rest[j], weight)
+    inverse = enlarged(np.linalg.inv(covariance).reshape(*weight.shape, 9))
+    inverse = inverse.reshape(HEIGHT, WIDTH, 3, 3)
+    off = picture.transpose(1, 2, 0) - model.mean.transpose(1, 2, 0)
+    off -= enlarged(light.transpose(1, 2, 0))
+    variance_ratio = (1 + (before / 3).clip(1, 8)) / 2
+    expected = np.einsum("hwi,hwij,hwj->hw", off, inverse, off) / variance_ratio
+    np.testing.assert_allclose(model.distance(picture), expected, rtol=1e-3, atol=1e-3)
+
+
+def region_means(layer: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    sums, total = (
+        cv2.blur(part, (5, 5), borderType=cv2.BORDER_REFLECT) for part in (weight * layer, weight)
+    )
+    return sums / (total + 1e-3)
+
+
+def enlarged(layers: np.ndarray) -> np.ndarray:
+    return cv2.resize(layers, (WIDTH, HEIGHT))
 
 
 @settings(max_examples=10)
@@ -67,9 +107,8 @@ def test_nothing_is_learnt_at_rate_zero():
 
 def test_a_colour_beside_the_line_of_the_waves_is_more_foreign_than_one_along_it():
     model = learnt([waves(i) for i in range(8)])
-    along, beside = model.mean.copy(), model.mean.copy()
-    along += np.array([20.0, 16.0, 8.0], np.float32)[:, None, None]
-    beside += np.array([-8.0, 0.0, 20.0], np.float32)[:, None, None]  # as far, at a right angle
+    along = picture_of(model.mean + np.array([20.0, 16.0, 8.0])[:, None, None])
+    beside = picture_of(model.mean + np.array([-8.0, 0.0, 20.0])[:, None, None])  # a right angle
     assert np.median(model.distance(beside)) > 20 * np.median(model.distance(along))
 
 
@@ -83,9 +122,9 @@ def test_a_fish_in_the_first_picture_is_not_taken_for_background():
 
 def test_a_change_of_light_is_not_foreign():
     model = learnt([noise(i) for i in range(5)])
-    lit = noise(7) + np.float32(15)
+    lit = noise(7, level=135)
     model.learn(lit, 0 * EVERYWHERE, EVERYWHERE)
-    assert model.distance(noise(8) + np.float32(15)).mean() < 6
+    assert model.distance(noise(8, level=135)).mean() < 6
 
 
 def test_a_pixel_that_always_changes_becomes_tolerant_by_eight_times_at_most():
@@ -93,9 +132,9 @@ def test_a_pixel_that_always_changes_becomes_tolerant_by_eight_times_at_most():
     changing = (slice(None), slice(None), slice(0, None, 16))  # every sixteenth column
     for i in range(3, 60):
         picture = noise(i)
-        picture[changing] += 60 * (-1) ** i
+        picture[changing] = noise(i, level=120 + 60 * (-1) ** i)[changing]
         model.learn(picture, model.distance(picture), EVERYWHERE)
-    distance = model.distance(model.mean + 60)
+    distance = model.distance(picture_of(model.mean + 60))
     ratio = np.median(distance[:, 8::16]) / np.median(distance[changing[1:]])
     assert 5 < ratio < 9
 
