@@ -193,13 +193,17 @@ def test_duckdb_opens_the_data_set(finished: Path):
     """In a process of its own: what duckdb leaks is printed at its end."""
     query = "SELECT vessel, trip, count(*) FROM read_parquet('{}', hive_partitioning = true) "
     query += "GROUP BY ALL ORDER BY trip"
-    code = "import sys, duckdb; print(duckdb.sql(sys.argv[1]).fetchall())"
-    for kind, count in (("fish", 2), ("frames", 10)):
-        asked = query.format(finished / "dataset" / kind / "**" / "*.parquet")
-        done = subprocess.run(
-            [sys.executable, "-c", code, asked], capture_output=True, text=True, check=True
-        )
-        assert literal_eval(done.stdout) == [("Sea/Bird", "", count), ("Sea/Bird", "7", count)]
+    code = "import sys, duckdb; print([duckdb.sql(one).fetchall() for one in sys.argv[1:]])"
+    asked = [
+        query.format(finished / "dataset" / kind / "**" / "*.parquet")
+        for kind in ("fish", "frames")
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *asked], capture_output=True, text=True, check=True
+    )
+    assert literal_eval(done.stdout) == [
+        [("Sea/Bird", "", count), ("Sea/Bird", "7", count)] for count in (2, 10)
+    ]
 
 
 def test_pandas_opens_the_data_set(finished: Path):
@@ -231,27 +235,22 @@ def test_verify_finds_a_changed_data_set(season: Path, tmp_path: Path):
     ]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "expected"),
-    [
+def test_verify_finds_a_changed_table_of_videos(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
+    table = tmp_path / "videos.csv"
+    for before, after, expected in (
         (",done,", ",failed,", "video: status is failed, outcome.json says done"),
         ("no such file", "is fine", "broken: reason is "),
         ("Sea Bird", "Other", "is missing"),  # where the data set has that vessel's fish
-    ],
-)
-def test_verify_finds_a_changed_table_of_videos(
-    season: Path, tmp_path: Path, before: str, after: str, expected: str
-):
-    jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
-    measure(jobs, tmp_path)
-    assert verify(tmp_path)[0] == []
-    table = tmp_path / "videos.csv"
-    text = table.read_text()
-    assert before in text
-    table.write_text(text.replace(before, after, 1))
-    found = [change.what for change in verify(tmp_path)[0]]
-    assert "was changed: its SHA-256 is not that in provenance.json" in found
-    assert any(what.startswith(expected) for what in found), found
+    ):
+        measure(jobs, tmp_path)
+        assert verify(tmp_path)[0] == []
+        text = table.read_text()
+        assert before in text
+        table.write_text(text.replace(before, after, 1))
+        found = [change.what for change in verify(tmp_path)[0]]
+        assert "was changed: its SHA-256 is not that in provenance.json" in found
+        assert any(what.startswith(expected) for what in found), found
     measure(jobs, tmp_path)
     assert verify(tmp_path)[0] == []
 
@@ -280,18 +279,6 @@ def test_a_report_shows_all_videos(season: Path, tmp_path: Path):
     assert [change.path for change in verify(tmp_path)[0]] == [target]
 
 
-def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: Path):
-    (job,) = jobs_of(season, tmp_path, row())
-    measure([job], tmp_path)
-    database = results_folder(job.name, tmp_path) / "lengths.db"
-    add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
-    seal_verdicts(database.parent)
-    measure([job], tmp_path)
-    fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
-    assert [one["verdict"] for one in fish] == [None, "reject"]
-    assert verify(tmp_path)[0] == []
-
-
 def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"))
     measure(jobs, tmp_path)
@@ -306,10 +293,12 @@ def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tm
     assert {one["video"] for one in tables} == {job.name for job in jobs}
 
 
-def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path, tmp_path: Path):
+def test_the_next_call_takes_verdicts_and_checks_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
     database = results_folder(job.name, tmp_path) / "lengths.db"
+    add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
+    seal_verdicts(database.parent)
     check = ScaleCheck(
         source="board.png",
         calibration_sha256=read_stored_fish(database)[0].facts.calibration_sha256,
@@ -319,6 +308,7 @@ def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path,
     add_check(database, check)
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
+    assert [one["verdict"] for one in fish] == [None, "reject"]
     assert [one["scale_error_percent"] for one in fish] == [4.0, 4.0]
     assert verify(tmp_path)[0] == []
 
