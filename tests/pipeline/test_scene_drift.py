@@ -57,7 +57,7 @@ def pictures(still: np.ndarray, seed: int) -> list[np.ndarray]:
 
 
 @given(st.floats(-25, 25), st.floats(-25, 25), st.integers(0, 99))
-@settings(max_examples=8)
+@settings(max_examples=4)
 def test_shift_is_measured_before_a_rolling_sea(x, y, seed):
     before = static_scene(pictures(deck(), seed), scale=2.0)
     now = static_scene(pictures(deck(shift=(x, y)), seed + 1000), scale=2.0)
