@@ -69,7 +69,7 @@ def test_a_wrong_size_is_answered_with_the_one_seen(rendered):
     assert wrong.not_found(picture) == (
         "no board of charuco:7x5 (squares) found; saw one of 8x6: check --board"
     )
-    empty = np.full((480, 640), 128, np.uint8)
+    empty = np.full((48, 64), 128, np.uint8)
     assert BOARD.find(empty) is None
     assert BOARD.not_found(empty) == "no board of charuco:8x6 (squares) found"
 
@@ -84,7 +84,7 @@ def folder(rendered, tmp_path_factory) -> Path:
     """plane.png, whole, and boards of which many reach out of the picture."""
     folder = tmp_path_factory.mktemp("charuco")
     assert cv2.imwrite(str(folder / "plane.png"), rendered.render(WHOLE))
-    for index, near in enumerate(varied_poses(9, distance_mm=250.0)):
+    for index, near in enumerate(varied_poses(6, distance_mm=250.0)):
         assert cv2.imwrite(str(folder / f"{index}.png"), rendered.render(near))
     return folder
 
@@ -94,8 +94,8 @@ def test_the_lens_and_the_plane_are_recovered(folder, tmp_path):
     options = {"--board": "charuco:8x6", "--square-mm": "30", "--marker-mm": "22"}
     options |= {"--plane": str(folder / "plane.png"), "--out": str(out)}
     pictures = sorted(folder.glob("[0-9]*.png"))
-    counts = [len(seen.pixels) for path in pictures if (seen := BOARD.find(read_grey(path)))]
-    assert min(counts) < 0.7 * INNER[0] * INNER[1]
+    seen = (BOARD.find(read_grey(path)) for path in pictures)
+    assert any(found and len(found.pixels) < 0.7 * INNER[0] * INNER[1] for found in seen)
     done = invoke("calibrate", options | {str(path): None for path in pictures})
     assert done.code == 0, done.error
     made = load_calibration(out)
@@ -103,7 +103,7 @@ def test_the_lens_and_the_plane_are_recovered(folder, tmp_path):
     distance = made.plane.rotation[:, 2] @ made.plane.translation_mm
     assert distance == pytest.approx(WHOLE.rotation[:, 2] @ WHOLE.translation_mm, rel=3e-3)
     drawn = sorted((tmp_path / "c-corners").iterdir())
-    assert len(drawn) == 10
+    assert len(drawn) == 7
 
 
 def test_the_scale_is_checked_with_half_a_board(rendered):
