@@ -35,6 +35,7 @@ def side_view(name: str, *, turn_rad: float = 0.0, length_px: float = 800.0) -> 
 
 
 @given(name=st.sampled_from(bundled_names()), turn_deg=st.floats(-180.0, 180.0))
+@settings(max_examples=10)
 def test_head_and_fork_are_found_in_any_direction(name: str, turn_deg: float):
     mask, head, tail = side_view(name, turn_rad=np.radians(turn_deg))
     outline = fish_outline(mask, name=name)
@@ -101,7 +102,7 @@ def ellipse(breadth: float, *, pointed: float = 0.0, turn_rad: float = 0.0) -> n
 
 
 @given(breadth=st.floats(0.06, 0.7), turn_deg=st.floats(-180.0, 180.0))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6)
 def test_an_outline_that_is_alike_from_both_ends_is_no_fish(breadth: float, turn_deg: float):
     with pytest.raises(TemplateError, match="whose ends are alike"):
         fish_outline(ellipse(breadth, turn_rad=np.radians(turn_deg)), name="x")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,7 @@ from tests.support.shapes import seeds
 
 
 @given(name=st.sampled_from(bundled_names()), seed=seeds, scale=st.floats(1e-2, 1e4))
+@settings(max_examples=10)
 def test_finds_the_points_of_every_body_form_in_any_unit_and_orientation(
     name: str, seed: int, scale: float
 ):
