@@ -16,7 +16,6 @@ from stream_dmr.web.agreement import agreements, cohens_kappa, length_agreement
 from stream_dmr.web.open_reports import open_report, run_folders
 from stream_dmr.web.review_queue import AuditSample, ReviewQueue, measured_numbers, sampled
 from tests.support.command import invoke
-from tests.support.fish_run import measure
 
 labels = st.sampled_from(["accept", "reject", "duplicate"])
 
@@ -46,11 +45,6 @@ def test_limits_of_agreement_of_known_differences():
     assert found.limits_mm == pytest.approx((2 - 1.96, 2 + 1.96))
     assert length_agreement([5.0]).limits_mm is None
     assert length_agreement([]).mean_mm is None
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("agreement"))
 
 
 def submit(queue: ReviewQueue, kind: str, track_id: int, **said: Any) -> None:

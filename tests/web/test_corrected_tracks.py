@@ -15,21 +15,10 @@ from stream_dmr.web.corrected_tracks import import_tracks
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.review_queue import ReviewQueue
 from tests.support.command import Outcome, invoke
-from tests.support.fish_run import measure
 from tests.web.test_edits import submit
 
 Rows = list[list[str]]  # cells: track, time, frame from 0, box, ...
 Facts = dict[int, tuple[object, ...]]  # by fish
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("corrected"))
-
-
-@pytest.fixture
-def out(measured: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(measured, tmp_path / "out"))
 
 
 def exported(out: Path) -> Path:

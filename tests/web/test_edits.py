@@ -1,7 +1,6 @@
 """Fish that reviewers add, split and merge: measured by the code of a run, kept and verified."""
 
 import json
-import shutil
 import sqlite3
 import threading
 from contextlib import closing, nullcontext
@@ -34,16 +33,6 @@ from tests.support.fish_run import measure, request
 from tests.support.tiny_clip import draw_mask, draw_picture, write_clip
 
 BOXES = {1: (8, 18, 52, 104), 5: (12, 18, 52, 100)}  # around fish 1, roughly
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("edits"))
-
-
-@pytest.fixture
-def out(measured: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(measured, tmp_path / "out"))
 
 
 @pytest.fixture

@@ -24,12 +24,6 @@ from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
 from tests.support.browser import Tab
 from tests.support.command import invoke, rows
-from tests.support.fish_run import measure
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("review"))
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.web.open_reports import open_folders
 from stream_dmr.web.review_queue import ReviewQueue, ReviewServer, species_choices
 from tests.support.browser import Tab
-from tests.support.fish_run import measure
 
 WAIT = """
 const until = async (what) => {
@@ -23,16 +22,6 @@ const key = (name) => document.activeElement.dispatchEvent(
   new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
 const message = () => document.getElementById("message") ?? { textContent: "" };
 """
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("keyboard"))
-
-
-@pytest.fixture
-def out(measured: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(measured, tmp_path / "out"))
 
 
 @pytest.fixture

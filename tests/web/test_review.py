@@ -1,7 +1,6 @@
 """Reviewing: verdicts come in by the page, are checked, and change no measurement."""
 
 import json
-import shutil
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -27,17 +26,6 @@ from stream_dmr.web.report_page import RunReport, render_page
 from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
 from tests.support.browser import Tab
 from tests.support.command import rows
-from tests.support.fish_run import measure
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("review"))
-
-
-@pytest.fixture
-def out(measured: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(measured, tmp_path / "out"))
 
 
 @pytest.fixture
