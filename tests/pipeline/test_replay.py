@@ -28,7 +28,6 @@ from tests.support.tiny_clip import HEIGHT, WIDTH, calibration, write_clip
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]
 NUM_FISH = 11  # in all frames together
 STAGES = ("crop", "fit", "localize", "smooth")
-FORMATS = ("recording.mcap", "recording.rrd")
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +37,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str |
     outcome = invoke("run", options)
     assert outcome.code == 0, outcome.err
     return Path(str(options["--out"])), options
+
+
+@pytest.fixture(scope="module")
+def rrd(run):
+    """Read once, which takes seconds."""
+    return open_recordings([run[0] / "recording.rrd"])
 
 
 def as_run(options, first):
@@ -67,9 +72,8 @@ def test_recomputed_is_what_was_recorded(run, first, name):
     assert f"check: {expected[first] + lengths} messages" in outcome.out
 
 
-def test_both_kinds_of_recording_hold_the_same(run):
-    folder, _ = run
-    mcap, rrd = (open_recordings([folder / name]) for name in FORMATS)
+def test_both_kinds_of_recording_hold_the_same(run, rrd):
+    mcap = open_recordings([run[0] / "recording.mcap"])
     assert mcap.header.attachments() == rrd.header.attachments()
     assert by_kind(mcap.payloads(TOPICS)) == by_kind(rrd.payloads(TOPICS))
 
@@ -179,15 +183,12 @@ def test_one_fish_alone_is_as_in_company(run):
     assert "check: 13 messages" in outcome.out  # 4 frames of 3 stages, and a final length
 
 
-def test_a_part_in_time_is_read_alone(run):
-    folder, _ = run
-    whole = open_recordings([folder])
+def test_a_part_in_time_is_read_alone(run, rrd):
+    whole = open_recordings([run[0]])
     times = [decode(LocalizedFish, p).timestamp_ns for _, p in whole.payloads([LocalizedFish])]
     low, high = times[3], times[8]
-    for name in FORMATS:
-        selection = open_recordings([folder / name]).payloads(
-            [LocalizedFish], Selection(time_ns=(low, high))
-        )
+    for recording in (whole, rrd):
+        selection = recording.payloads([LocalizedFish], Selection(time_ns=(low, high)))
         found = [decode(LocalizedFish, p).timestamp_ns for _, p in selection]
         assert found == [t for t in times if low <= t < high]
 
