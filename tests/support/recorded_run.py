@@ -81,13 +81,11 @@ def header(*, calibrated: bool = True) -> RunHeader:
 
 def run(num_frames: int, *, num_fish: int = 2, calibrated: bool = True) -> Iterator[Message]:
     """Every message of a run, in the order of the chain; fish 2 leaves after two thirds."""
-    rng = np.random.default_rng(1)
-    scene = rng.normal(110, 8, (HEIGHT, WIDTH, 3))
+    scene, noise = _water()
     for index in range(1, num_frames + 1):
-        image = np.clip(scene + rng.normal(0, 4, scene.shape[:2])[..., None], 0, 255)
+        image = np.clip(scene + np.roll(noise, 37 * index, axis=(0, 1)), 0, 255).astype(np.uint8)
         present = [i for i in range(1, num_fish + 1) if i != 2 or index <= 2 * num_frames / 3]
         bodies = {i: _body(i, index) for i in present}
-        image = image.astype(np.uint8)
         outlines = {i: _draw(image, body, i) for i, body in bodies.items()}
         time = {"frame_index": index, "timestamp_ns": index * FRAME_NS}
         yield Frame(**time, image=image, source="clip.mp4")
@@ -97,6 +95,13 @@ def run(num_frames: int, *, num_fish: int = 2, calibrated: bool = True) -> Itera
     for i in range(1, num_fish + 1):
         last = num_frames if i != 2 else 2 * num_frames // 3
         yield _estimate(i, last, calibrated, is_final=True)
+
+
+@cache
+def _water() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    scene, noise = rng.normal(110, 8, (HEIGHT, WIDTH, 3)), rng.normal(0, 4, (HEIGHT, WIDTH, 1))
+    return scene.astype(np.int16), noise.astype(np.int16)
 
 
 def assert_same(one: object, other: object, where: str = "") -> None:
