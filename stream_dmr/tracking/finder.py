@@ -45,16 +45,20 @@ class Sightings:
     tracks: int = 0
     any_moved: bool = False  # a track moved from its place
     any_fish_like: bool = False  # a track that moved looked like a fish
+    best_score: float = 0.0  # of any candidate
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
 
 
+class TrackFishSettings(TrackerSettings, ConfirmationSettings):
+    """`[track_fish]`: how detected fish are followed, and which count."""
+
+
 def explain_no_fish(
-    seen: Sightings, refused: Mapping[str, int], *, min_frames: int, min_confidence: float
+    seen: Sightings, refused: Mapping[str, int], settings: TrackFishSettings
 ) -> str:
     """Return one line: why no fish was found in these frames, and what to do.
 
-    `refused` are the detector's shapes that were no candidates, by reason; `min_frames` and
-    `min_confidence` are `[track_fish] min_track_frames` and `min_mask_confidence`.
+    `refused` are the detector's shapes that were no candidates, by reason.
     """
     begin = f"no fish in {seen.frames} frames: "
     commonest = sorted(refused.items(), key=lambda item: -item[1])
@@ -71,6 +75,12 @@ def explain_no_fish(
             f"all {sum(refused.values())} moving shapes were refused ({shapes}); change that "
             "setting where these were fish"
         )
+    if seen.best_score < settings.min_score:
+        return begin + (
+            f"{seen.candidates} shapes looked a little like a fish, the most with a score of "
+            f"{seen.best_score:.2f}, below [track_fish] min_score = {settings.min_score:g}; lower "
+            "it, or give --boxes"
+        )
     if seen.tracks > 0 and not seen.any_moved:
         return begin + (
             f"{seen.tracks} shapes were followed, none left its place by a quarter of its size, "
@@ -82,16 +92,16 @@ def explain_no_fish(
             f"{seen.tracks} shapes were followed, none looked like a fish to the network; set "
             "[track_fish] min_fish_like_frames = 0 where they are fish"
         )
-    if seen.best_confidence < min_confidence:
+    if seen.best_confidence < settings.min_mask_confidence:
         return begin + (
             f"{seen.candidates} shapes were looked at, and no mask was as sure as [track_fish] "
-            f"min_mask_confidence = {min_confidence:g} (the surest {seen.best_confidence:.2f}); "
-            "lower it, or train the network on these pictures"
+            f"min_mask_confidence = {settings.min_mask_confidence:g} (the surest "
+            f"{seen.best_confidence:.2f}); lower it, or train the network on these pictures"
         )
     return begin + (
-        f"{seen.tracks} shapes were followed, none with a sure mask in {min_frames} frames and a "
-        "tenth of all within the zone; lower [track_fish] min_track_frames, or widen zone; "
-        "--stills for single pictures"
+        f"{seen.tracks} shapes were followed, none with a sure mask in "
+        f"{settings.min_track_frames} frames and a tenth of all within the zone; lower "
+        "[track_fish] min_track_frames, or widen zone; --stills for single pictures"
     )
 
 
@@ -124,10 +134,6 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
 _MAX_AT_ONCE = 2  # closer looks in a frame; each takes as long as four looks at a whole frame
 
 
-class TrackFishSettings(TrackerSettings, ConfirmationSettings):
-    """`[track_fish]`: how detected fish are followed, and which count."""
-
-
 class TrackedFish:
     """A `FishFinder` that tracks a detector's candidates and confirms those with fish masks."""
 
@@ -153,6 +159,8 @@ class TrackedFish:
         tracked = self._tracker.step(frame, candidates)
         self._seen.frames += 1
         self._seen.candidates += len(candidates)
+        scores = [candidate.score for candidate in candidates]
+        self._seen.best_score = max([self._seen.best_score, *scores])
         if self.has_masks:
             tracked = [fish for fish in tracked if fish.candidate.foreground is not None]
         boxes = {fish.track_number: fish.candidate.bbox_xyxy_px for fish in tracked}
@@ -244,13 +252,7 @@ class TrackedFish:
         """Why there are no fish, if there are none. A fish missed among others is not noticed."""
         if self._found_any or self._seen.frames == 0:
             return []
-        line = explain_no_fish(
-            self._seen,
-            self._detector.refused,
-            min_frames=self._settings.min_track_frames,
-            min_confidence=self._settings.min_mask_confidence,
-        )
-        return [line]
+        return [explain_no_fish(self._seen, self._detector.refused, self._settings)]
 
     @property
     def unused(self) -> list[str]:

@@ -1,5 +1,7 @@
 """A run without fish says what was seen, and which setting to change."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,10 @@ from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.messages import Frame
 from stream_dmr.tracking.finder import Sightings, TrackedFish, TrackFishSettings, explain_no_fish
 
-LIMITS = {"min_frames": 4, "min_confidence": 0.8}
+LIMITS = TrackFishSettings(min_mask_confidence=0.8)
+
+
+LOOKED_AT = Sightings(frames=9, candidates=5, best_score=0.9, best_confidence=0.9)
 
 
 @pytest.mark.parametrize(
@@ -15,33 +20,15 @@ LIMITS = {"min_frames": 4, "min_confidence": 0.8}
     [
         (Sightings(frames=9), {}, "nothing moved or looked like a fish"),
         (Sightings(frames=9), {"shorter than [detect_fish] motion_min_length": 14}, "all 14"),
-        (Sightings(frames=9, candidates=5, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
-        (
-            Sightings(frames=9, candidates=5, tracks=2, best_confidence=0.9),
-            {},
-            "none left its place",
-        ),
-        (
-            Sightings(frames=9, candidates=5, tracks=2, any_moved=True, best_confidence=0.9),
-            {},
-            "min_fish_like_frames = 0",
-        ),
-        (
-            Sightings(
-                frames=9,
-                candidates=5,
-                tracks=2,
-                any_moved=True,
-                any_fish_like=True,
-                best_confidence=0.9,
-            ),
-            {},
-            "min_track_frames",
-        ),
+        (replace(LOOKED_AT, best_score=0.26), {}, "score of 0.26, below [track_fish] min_score"),
+        (replace(LOOKED_AT, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
+        (replace(LOOKED_AT, tracks=2), {}, "none left its place"),
+        (replace(LOOKED_AT, tracks=2, any_moved=True), {}, "min_fish_like_frames = 0"),
+        (replace(LOOKED_AT, tracks=2, any_moved=True, any_fish_like=True), {}, "min_track_frames"),
     ],
 )
 def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
-    line = explain_no_fish(seen, refused, **LIMITS)
+    line = explain_no_fish(seen, refused, LIMITS)
     assert line.startswith("no fish in 9 frames: ")
     assert words in line
     assert "\n" not in line
@@ -52,8 +39,8 @@ SHORT = "shorter than [detect_fish] motion_min_length"
 
 @pytest.mark.parametrize(("count", "is_said"), [(500, True), (5, False)])
 def test_small_shapes_are_named_where_most_of_what_moved_was_small(count, is_said):
-    seen = Sightings(frames=90, candidates=20, tracks=2, best_confidence=0.9)
-    line = explain_no_fish(seen, {SHORT: count}, **LIMITS)
+    seen = replace(LOOKED_AT, frames=90, candidates=20, tracks=2)
+    line = explain_no_fish(seen, {SHORT: count}, LIMITS)
     assert (f"{count} {SHORT}" in line) is is_said
     assert "none left its place" in line
 
