@@ -86,9 +86,8 @@ def derive(
     lengths = {kind: found[kind][0] if kind in found else None for kind in LENGTHS}
     sources = dict.fromkeys(source for _, source in found.values() if source)
     is_species = is_same_species(species or template.name, settings.species)
-    weighed, legal = lengths[settings.weight_length], lengths[settings.legal_length]
-    has_weight = is_species and settings.weight_a > 0 and weighed is not None
-    has_legal = is_species and settings.legal_cm > 0 and legal is not None
+    weighed_mm = lengths[settings.weight_length] if is_species and settings.weight_a else None
+    legal_mm = lengths[settings.legal_length] if is_species and settings.legal_cm else None
     return Derived(
         fork_length_mm=lengths["fork"],
         total_length_mm=lengths["total"],
@@ -97,8 +96,8 @@ def derive(
         disc_width_mm=lengths["disc width"],
         conversion_source="; ".join(sources) or None,
         length_cm=whole_cm(length_mm, settings.rounding),
-        weight_kg=weight_kg(weighed, settings) if has_weight and weighed is not None else None,
-        is_legal_size=legal / 10 >= settings.legal_cm if has_legal and legal is not None else None,
+        weight_kg=None if weighed_mm is None else weight_kg(weighed_mm, settings),
+        is_legal_size=None if legal_mm is None else legal_mm / 10 >= settings.legal_cm,
     )
 
 

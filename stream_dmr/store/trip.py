@@ -35,8 +35,7 @@ def hauls_of(rows: Iterable[Mapping[str, Any]]) -> list[Haul]:
     hauls: list[Haul] = []
     for row in sorted(rows, key=lambda row: row["timestamp_ns"]):
         if hauls and hauls[-1].ended_ns is None:
-            last = hauls.pop()
-            hauls.append(Haul(name=last.name, began_ns=last.began_ns, ended_ns=row["timestamp_ns"]))
+            hauls[-1] = replace(hauls[-1], ended_ns=row["timestamp_ns"])
         if row["what"] == START:
             hauls.append(Haul(name=row["name"], began_ns=row["timestamp_ns"]))
     return hauls

@@ -115,14 +115,10 @@ class Review:
         before = Review() if verdict.kind == "withdraw" else self
         now = replace(before, reviewer=verdict.reviewer, written_ns=verdict.written_ns)
         match verdict.kind:
-            case "withdraw":
+            case "withdraw" | "add" | "split":
                 return now
-            case "species":
-                return replace(now, species=verdict.species)
-            case "fate":
-                return replace(now, fate=verdict.fate)
-            case "condition":
-                return replace(now, condition=verdict.condition)
+            case "species" | "fate" | "condition":
+                return replace(now, **{verdict.kind: getattr(verdict, verdict.kind)})
             case "correct":
                 return replace(
                     now,
@@ -130,8 +126,6 @@ class Review:
                     length_std_mm=verdict.length_std_mm,
                     moved={**now.moved, **verdict.moved},
                 )
-            case "add" | "split":
-                return now
             case "merge":
                 return replace(now, decision="merge", duplicate_of=verdict.other_fish)
             case _:
