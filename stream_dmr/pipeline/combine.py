@@ -92,31 +92,20 @@ class FishSightings(NamedTuple):
 
 def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, FishSightings]:
     """The tracks of a run by their ids, of the frames that two cameras may use."""
-    times: dict[int, list[int]] = {}
-    midlines: dict[int, list[Float[np.ndarray, "M 2"]]] = {}
-    centers: dict[int, list[np.ndarray]] = {}
-    ious: dict[int, list[float]] = {}
-    lengths: dict[int, list[float]] = {}
+    seen: dict[int, list[tuple[int, np.ndarray, np.ndarray, float, float]]] = {}
     for frame in fish:
         if frame.reason not in _BY_ONE_CAMERA or frame.keypoints_px is None:
             continue
         if frame.midline_mm is not None and frame.length_mm is not None:
             midline_px = calibration.camera.project(frame.midline_mm)
-            times.setdefault(frame.track_id, []).append(frame.timestamp_ns)
-            midlines.setdefault(frame.track_id, []).append(midline_px)
-            centers.setdefault(frame.track_id, []).append(frame.keypoints_px[1])
-            ious.setdefault(frame.track_id, []).append(frame.iou or 0.0)
-            lengths.setdefault(frame.track_id, []).append(frame.length_mm)
-    return {
-        track_id: FishSightings(
-            times_ns=np.array(times[track_id]),
-            midlines_px=np.stack(midlines[track_id]),
-            centers_px=np.stack(centers[track_id]),
-            ious=np.array(ious[track_id]),
-            length_mm=float(np.median(lengths[track_id])),
-        )
-        for track_id in times
-    }
+            center_px, iou = frame.keypoints_px[1], frame.iou or 0.0
+            values = frame.timestamp_ns, midline_px, center_px, iou, frame.length_mm
+            seen.setdefault(frame.track_id, []).append(values)
+    tracks = dict[int, FishSightings]()
+    for track_id, frames in seen.items():
+        *values, lengths_mm = (np.array(of_frames) for of_frames in zip(*frames, strict=True))
+        tracks[track_id] = FishSightings(*values, length_mm=float(np.median(lengths_mm)))
+    return tracks
 
 
 def well_fitted(
@@ -127,12 +116,8 @@ def well_fitted(
     for track_id, fish in tracks.items():
         chosen = fish.ious >= settings.min_iou
         if chosen.any():
-            found[track_id] = fish._replace(
-                times_ns=fish.times_ns[chosen],
-                midlines_px=fish.midlines_px[chosen],
-                centers_px=fish.centers_px[chosen],
-                ious=fish.ious[chosen],
-            )
+            *values, length_mm = fish
+            found[track_id] = FishSightings(*(of[chosen] for of in values), length_mm=length_mm)
     return found
 
 
