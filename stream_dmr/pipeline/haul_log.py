@@ -58,7 +58,7 @@ class HaulLog:
         self._in_chain: deque[int] = deque()  # capture times of the frames in the chain, in order
         self._fast_since_ns: int | None = None
         self._now_ns = 0  # capture time of the latest frame
-        self._watched: list[int] | None = None  # first and last capture time, frames, lost
+        self._watched: dict[str, int] | None = None  # the next row of `watched`
         self._lost_before = 0
 
     def hauls(self) -> list[Haul]:
@@ -143,24 +143,21 @@ class HaulLog:
     def _watch(self, timestamp_ns: int, lost: int) -> None:
         new_lost, self._lost_before = max(0, lost - self._lost_before), lost
         if self._watched is not None:
-            first_ns, last_ns, _, _ = self._watched
-            if timestamp_ns - last_ns > _PAUSE_NS:
+            if timestamp_ns - self._watched["last_ns"] > _PAUSE_NS:
                 self._write_watched()
-            elif timestamp_ns - first_ns > _WATCHED_NS:
-                self._watched[1] = timestamp_ns
+            elif timestamp_ns - self._watched["first_ns"] > _WATCHED_NS:
+                self._watched["last_ns"] = timestamp_ns
                 self._write_watched()
         if self._watched is None:
-            self._watched = [timestamp_ns, timestamp_ns, 0, 0]
-        self._watched[1] = timestamp_ns
-        self._watched[2] += 1
-        self._watched[3] += new_lost
+            self._watched = {"first_ns": timestamp_ns, "last_ns": 0, "frames": 0, "frames_lost": 0}
+        self._watched["last_ns"] = timestamp_ns
+        self._watched["frames"] += 1
+        self._watched["frames_lost"] += new_lost
 
     def _write_watched(self) -> None:
         if self._watched is not None:
-            names = ("first_ns", "last_ns", "frames", "frames_lost")
-            values: dict[str, object] = dict(zip(names, self._watched, strict=True))
-            name = str(self._watched[0])
-            self._store.append(WATCHED, name, values, is_urgent=False)
+            name = str(self._watched["first_ns"])
+            self._store.append(WATCHED, name, self._watched, is_urgent=False)
         self._watched = None
 
 
