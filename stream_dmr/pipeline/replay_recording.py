@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from stream_dmr.pipeline.session import (
     PlaybackNode,
     RecordedMessages,
     Session,
+    SoughtMessages,
     messages_before,
     messages_from,
     stage_number,
@@ -62,16 +63,13 @@ from stream_dmr.store.schema import CUT_OFF_BY_STOP
 from stream_dmr.tracking.finder import open_finder
 
 
-@dataclass(frozen=True, kw_only=True)
-class OriginalRun:
-    """Facts that the lengths.db beside a recording has and the recording doesn't."""
+def read_recorded_run(
+    recordings: Sequence[Path], header: RunHeader
+) -> tuple[RunFacts | None, Mapping[int, Sequence[str]]]:
+    """What the lengths.db beside recordings has of their run: its facts, and flags by track.
 
-    facts: RunFacts | None = None  # None: there is no such run in it, or no lengths.db
-    flags: Mapping[int, Sequence[str]] = field(default_factory=dict[int, Sequence[str]])
-
-
-def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> OriginalRun:
-    """The run that made the recordings. Raises OutputError if lengths.db is damaged."""
+    None and no flags without such a run in it. Raises OutputError if lengths.db is damaged.
+    """
     folders = [path if path.is_dir() else path.parent for path in recordings]
     databases = [database for folder in folders if (database := database_of(folder)) is not None]
     expected = run_facts(header)
@@ -80,7 +78,7 @@ def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> Original
         flags |= {fish.estimate.track_id: fish.flags for fish in read_measured_fish(database)}
         made = [run for run in read_runs(database).values() if _is_same(run, expected)]
         facts = made[-1] if made else facts
-    return OriginalRun(facts=facts, flags=flags)
+    return facts, flags
 
 
 def _is_same(run: RunFacts, expected: RunFacts) -> bool:
@@ -105,20 +103,18 @@ def open_replay_outputs(
     """
     header = new_header(request, recording.header, inputs, second)
     try:
-        recorded = read_recorded_run(request.recordings, recording.header)
+        known, flags = read_recorded_run(request.recordings, recording.header)
     except OutputError as error:
         observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
-        recorded = OriginalRun()
+        known, flags = None, {}
     signer = None if request.key is None else Signer(request.key)
     if inputs.candidates is not None and inputs.candidates.stocks() is not None:
         require_free_names(out, overwrite=request.overwrite)
     prepare_folder(out, overwrite=request.overwrite)
-    facts, known = run_facts(header), recorded.facts
+    facts = run_facts(header)
     if known is not None:
-        taken_over = {
-            name: getattr(known, name) for name in ("vessel", "trip", "haul", "utc_zero_ns")
-        }
-        facts = replace(facts, **taken_over)
+        names = ("vessel", "trip", "haul", "utc_zero_ns")
+        facts = replace(facts, **{name: getattr(known, name) for name in names})
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
         store = stack.enter_context(closing(LengthStore(out, facts, signer=signer)))
@@ -140,7 +136,7 @@ def open_replay_outputs(
             store,
             lengths,
             recorder,
-            flags=recorded.flags,
+            flags=flags,
             flag_at_end=lambda: CUT_OFF_BY_STOP if stop.is_set() else "",
             sensors=inputs.config.sensors,
             on_notice=observer.warn,
@@ -180,8 +176,8 @@ class ReplayWriter:
         """`results`, None without --out, gets `whole` records of messages not recomputed."""
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
         self._results, self._whole, self._comparator = results, whole, comparator
-        self._positions = recorded.of_type(Position, keep_payloads=False)
-        self._next_position = None if results is None else next(self._positions, None)
+        positions = recorded.of_type(Position, keep_payloads=False)
+        self._positions = SoughtMessages(iter(()) if results is None else positions)
         self.totals = RunTotals(max_fish=None)
         self.num_frames = 0
 
@@ -203,22 +199,16 @@ class ReplayWriter:
             self._results.store(message)
             self._results.put(self._whole.of(message, payload))
             if isinstance(message, Frame):
-                self._write_positions(self._results, message.frame_index)
+                for position in self._positions.until(message.frame_index):
+                    self._results.write(position)
         return message
 
     def finish(self) -> None:
         """Record the rest after the last frame: positions, and messages of a second camera."""
         if self._results is not None:
             self._results.put(self._whole.rest())
-            self._write_positions(self._results, None)
-
-    def _write_positions(self, results: ResultWriter, until_frame: int | None) -> None:
-        """Record the positions up to a frame, as they were recorded; None: all that are left."""
-        while (position := self._next_position) is not None:
-            if until_frame is not None and position.frame_index > until_frame:
-                return
-            results.write(position)
-            self._next_position = next(self._positions, None)
+            for position in self._positions.rest():
+                self._results.write(position)
 
     def frame_done(self) -> None:
         if self._results is not None:

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryFile
@@ -402,22 +403,13 @@ class SoughtMessages:
 
     def until(self, frame_index: int) -> list[Message]:
         """The next messages up to a frame, in their order."""
-        found: list[Message] = []
-        while (message := self._next) is not None and message.frame_index <= frame_index:
-            found.append(message)
-            self._next = next(self._messages, None)
-        return found
+        return [*iter(partial(self._take_next, frame_index), None)]
 
     def take(self, frame_index: int, track_id: int) -> Message | None:
         """The message of this frame and fish, if there is one."""
-        key = frame_index, track_id
-        while (
-            key not in self._passed
-            and (message := self._next) is not None
-            and message.frame_index <= frame_index + _AHEAD_FRAMES
-        ):
+        key, last = (frame_index, track_id), frame_index + _AHEAD_FRAMES
+        while key not in self._passed and (message := self._take_next(last)) is not None:
             self._passed[message.frame_index, track_of(message)] = message
-            self._next = next(self._messages, None)
         return self._passed.pop(key, None)
 
     def rest(self) -> Iterator[Message]:
@@ -426,6 +418,14 @@ class SoughtMessages:
         if self._next is not None:
             yield self._next
         yield from self._messages
+
+    def _take_next(self, last_frame: int) -> Message | None:
+        """The next message, unless it is of a later frame."""
+        message = self._next
+        if message is None or message.frame_index > last_frame:
+            return None
+        self._next = next(self._messages, None)
+        return message
 
 
 class PlaybackNode:

@@ -123,15 +123,15 @@ def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Reco
 def test_the_database_beside_a_recording_knows_vessel_and_flags(
     recording: Recording, folder: Path, tmp_path: Path
 ):
-    known = read_recorded_run([folder], recording.header)
-    assert known.facts is not None
-    assert known.facts.vessel == "Sea Bird"
-    assert known.flags == {1: ["the camera seems bumped"]}
-    assert read_recorded_run([tmp_path], recording.header).facts is None
+    facts, flags = read_recorded_run([folder], recording.header)
+    assert facts is not None
+    assert facts.vessel == "Sea Bird"
+    assert flags == {1: ["the camera seems bumped"]}
+    assert read_recorded_run([tmp_path], recording.header) == (None, {})
 
 
 def test_another_run_in_the_database_is_not_taken_for_the_recorded_one(
     recording: Recording, folder: Path
 ):
     other = replace(recording.header, command="stream-dmr run --source other.mp4")
-    assert read_recorded_run([folder], other).facts is None
+    assert read_recorded_run([folder], other)[0] is None
