@@ -319,10 +319,8 @@ def _expected(field: FieldInfo, problem: ErrorDetails) -> str:
 
 def _toml_name(value: object) -> str:
     match value:
-        case bool():
-            return str(value).lower()
         case int() | float():
-            return f"{value!r}"
+            return toml_value(value)
         case str():
             return f'the string "{value}"'
         case list():

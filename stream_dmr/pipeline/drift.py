@@ -104,10 +104,11 @@ def compare_scenes(before: StaticScene, now: StaticScene) -> SceneChange:
     window = cv2.createHanningWindow(before.edges.shape[::-1], cv2.CV_32F)
     # Copies, since OpenCV multiplies its arguments by the window in place.
     (x, y), _ = cv2.phaseCorrelate(before.edges.copy(), now.edges.copy(), window)
+    back = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y]])
     strength = _edge_strength(before.edges)
     return SceneChange(
         shift_px=float(np.hypot(x, y)) * before.scale,
-        likeness=_likeness(before.edges, _shifted(now.edges, -x, -y)),
+        likeness=_likeness(before.edges, cv2.warpAffine(now.edges, back, now.edges.shape[::-1])),
         sharpness=_edge_strength(now.edges) / strength if strength > 0 else 1.0,
     )
 
@@ -118,11 +119,6 @@ def _likeness(before: Float32[np.ndarray, "h w"], now: Float32[np.ndarray, "h w"
     a, b = a - a.mean(), b - b.mean()
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / size if size > 0 else 0.0
-
-
-def _shifted(edges: Float32[np.ndarray, "h w"], x: float, y: float) -> Float32[np.ndarray, "h w"]:
-    motion = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
-    return cv2.warpAffine(edges, motion, (edges.shape[1], edges.shape[0]))
 
 
 def _edge_strength(edges: Float32[np.ndarray, "h w"]) -> float:

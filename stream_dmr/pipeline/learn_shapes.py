@@ -19,7 +19,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from threading import Event
 from typing import TypeVar
@@ -331,14 +330,14 @@ class SeenFish:
         self._num = 0
 
     def take(self, message: Message) -> None:
-        match message:
-            case FishCrop(track_id=track_id):
-                with self._lock:
-                    self._tracks.setdefault(track_id, GoodCrops()).add(message)
-            case LengthEstimate(is_final=True, track_id=track_id):
-                self._finish(track_id)
-            case _:
-                pass
+        with self._lock:
+            if isinstance(message, FishCrop):
+                self._tracks.setdefault(message.track_id, GoodCrops()).add(message)
+            elif isinstance(message, LengthEstimate) and message.is_final:
+                crops = self._tracks.pop(message.track_id, GoodCrops()).chosen()
+                if crops:
+                    self._fish.append(crops)
+                    self._num += 1
 
     @property
     def num(self) -> int:
@@ -348,14 +347,7 @@ class SeenFish:
 
     def crops(self) -> list[FishCrop]:
         with self._lock:
-            return [*chain.from_iterable(self._fish)]
-
-    def _finish(self, track_id: int) -> None:
-        with self._lock:
-            crops = self._tracks.pop(track_id, GoodCrops()).chosen()
-            if crops:
-                self._fish.append(crops)
-                self._num += 1
+            return [*itertools.chain.from_iterable(self._fish)]
 
 
 _FIRST = 3  # finished fish after which shapes are learnt, then after twice as many, and so on
