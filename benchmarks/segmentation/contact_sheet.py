@@ -19,7 +19,7 @@ import numpy as np
 from stream_dmr.messages import FishCrop, FittedMesh, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.template.template_file import load_template
@@ -49,7 +49,7 @@ def fit_video(video: str, *, template: str, path: Path | None) -> list[Pair]:
         return message
 
     reader = ReadFrames(video, config.read_frames)
-    run_chain(reader, [node, *later], on_message=note, stop=threading.Event())
+    Chain(reader, [node, *later], on_message=note, stop=threading.Event()).run()
     reader.close()
     return pairs
 

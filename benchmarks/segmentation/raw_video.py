@@ -28,7 +28,7 @@ from stream_dmr.evaluation.length_tables import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
@@ -105,7 +105,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Chai
 
     reader = ReadFrames(str(scene / "video.mp4"), config.read_frames)
     stop = threading.Event()
-    run_chain(reader, [crop_fish, *later], on_message=note, stop=stop)
+    Chain(reader, [crop_fish, *later], on_message=note, stop=stop).run()
     reader.close()
     return ran
 

@@ -82,48 +82,26 @@ class _Batch:
 _Inbox = queue.Queue[_Batch]
 
 
-def run_chain(
-    source: Iterable[Frame],
-    nodes: Sequence[Node],
-    *,
-    on_message: Callable[[Message], Message],
-    stop: threading.Event,
-    on_frame: Callable[[], None] = lambda: None,
-    on_start: Callable[["Chain"], None] = lambda chain: None,
-    on_failure: Callable[[str, Exception], bool] = lambda stage, error: False,
-    in_one_thread: bool = False,
-) -> list[StageCounters]:
-    """Run every frame of `source` through `nodes`; return the counters of source and nodes.
+@dataclass(eq=False)
+class Chain:
+    """Runs every frame of `source` through `nodes`: stage 0 is the source, stage k the k-th node.
 
     `on_message` takes every message of every stage, in the stage's order and thread, and returns
     the message that the next stage gets: a recorder returns what a replay will read. `on_frame` is
-    called when a frame has left the last stage; `on_start` gets the chain, to observe it.
+    called when a frame has left the last stage. Counters may be read at any time.
 
     Setting `stop` ends the chain soon: the busiest stage and those before it drop the frames that
     they have not begun, the stages after it finish theirs, and every node is closed. An exception
-    ends the chain in the same way at its stage, and is raised here; if `on_failure` (stage name,
+    ends the chain in the same way at its stage, and `run` raises it; if `on_failure` (stage name,
     exception) returns True, only the node's current work is lost.
-
-    The results with `in_one_thread` are the same. It is three times as fast if all stages are
-    Python, whose threads exclude each other.
     """
-    chain = Chain(
-        source, nodes, on_message=on_message, on_frame=on_frame, on_failure=on_failure, stop=stop
-    )
-    on_start(chain)
-    return chain.run_in_line() if in_one_thread else chain.run()
-
-
-@dataclass(eq=False)
-class Chain:
-    """A run: stage 0 is the source, stage k the k-th node. Counters may be read at any time."""
 
     source: Iterable[Frame]
     nodes: Sequence[Node]
     _: KW_ONLY
     on_message: Callable[[Message], Message]
-    on_frame: Callable[[], None]
-    on_failure: Callable[[str, Exception], bool]
+    on_frame: Callable[[], None] = lambda: None
+    on_failure: Callable[[str, Exception], bool] = lambda stage, error: False
     stop: threading.Event
 
     def __post_init__(self) -> None:
@@ -149,8 +127,21 @@ class Chain:
         now = time.perf_counter()
         return max((now - s for s in self._busy_since[1:] if s is not None), default=0.0)
 
-    def run(self) -> list[StageCounters]:
-        """Run to the end, once; see `run_chain`."""
+    def run(self, *, in_one_thread: bool = False) -> list[StageCounters]:
+        """Run to the end, once; return the counters of source and nodes.
+
+        The results with `in_one_thread` are the same. It is three times as fast if all stages are
+        Python, whose threads exclude each other.
+        """
+        if in_one_thread:
+            self._run_in_line()
+        else:
+            self._run_in_threads()
+        if self._failure is not None:
+            raise self._failure
+        return self.counters
+
+    def _run_in_threads(self) -> None:
         threads = [threading.Thread(target=self._run_source, name="source", daemon=True)]
         threads += [
             threading.Thread(target=self._run_node, args=(stage,), name=f"stage-{stage}")
@@ -170,12 +161,8 @@ class Chain:
             self._cut = len(self.nodes)
             threads[0].join(_SOURCE_GRACE_S)
             self._count_leftovers()
-        if self._failure is not None:
-            raise self._failure
-        return self.counters
 
-    def run_in_line(self) -> list[StageCounters]:
-        """Run to the end in this thread alone; see `run_chain`."""
+    def _run_in_line(self) -> None:
         try:
             frames = iter(self.source)
             while self._failure is None and (batch := self._read(frames)) is not None:
@@ -183,9 +170,6 @@ class Chain:
         except BaseException as error:
             self._fail(0, error)
         self._pass_through(_Batch(kind="end"), close=True)
-        if self._failure is not None:
-            raise self._failure
-        return self.counters
 
     def _pass_through(self, batch: _Batch, *, close: bool = False) -> None:
         for stage, node in enumerate(self.nodes, start=1):

@@ -51,7 +51,7 @@ from stream_dmr.messages import (
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.run_folder import require_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import RunObserver
@@ -206,7 +206,7 @@ def _first_pass(
             frames.keep(message)
         return message
 
-    run_chain(reader, [crop_fish], on_message=take, on_frame=observer.frame_done, stop=stop)
+    Chain(reader, [crop_fish], on_message=take, on_frame=observer.frame_done, stop=stop).run()
     reader.close()
     if frames is None:
         reader = ReadFrames(inputs.request.source, config.read_frames)

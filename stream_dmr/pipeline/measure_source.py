@@ -15,7 +15,7 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.messages import Frame, LengthEstimate, Message, Position
-from stream_dmr.pipeline.chain import Chain, ErrorPolicy, StageCounters, run_chain
+from stream_dmr.pipeline.chain import Chain, ErrorPolicy, StageCounters
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
     ShapeLearner,
@@ -285,22 +285,19 @@ def _run_chain(
     began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
     flow = MessageFlow(inputs, session, outputs, observer, stop)
-
-    def begin(chain: Chain) -> None:
-        observer.attach(chain)
-        inputs.source.announce_pauses(chain.pause)
-
+    chain = Chain(
+        inputs.reader,
+        session.nodes,
+        on_message=flow.take,
+        on_frame=flow.frame_done,
+        on_failure=flow.policy.continues_after,
+        stop=stop,
+    )
     try:
         with _noting_the_end(inputs, outputs.store, stop):
-            counters = run_chain(
-                inputs.reader,
-                session.nodes,
-                on_message=flow.take,
-                on_frame=flow.frame_done,
-                on_start=begin,
-                on_failure=flow.policy.continues_after,
-                stop=stop,
-            )
+            observer.attach(chain)
+            inputs.source.announce_pauses(chain.pause)
+            counters = chain.run()
     finally:
         flow.finish()
     names = result_names(inputs.config.recording, is_endless=inputs.is_endless)

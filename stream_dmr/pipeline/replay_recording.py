@@ -20,7 +20,7 @@ from stream_dmr.messages import (
     TrackEnded,
 )
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
+from stream_dmr.pipeline.chain import Chain, Node, StageCounters
 from stream_dmr.pipeline.combine import LocalizeByTwo, SecondRun, open_second
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_learnt
@@ -296,14 +296,13 @@ def replay(
 
         observer.begin(None)
         began = time.perf_counter()
-        counters = run_chain(
+        counters = Chain(
             frames,
             session.nodes,
             on_message=writer.write,
             on_frame=on_frame,
             stop=stop,
-            in_one_thread=_is_light(request),
-        )
+        ).run(in_one_thread=_is_light(request))
         writer.finish()
     comparator.finish()
     for line in (*recording.warnings, *recorded.notes):

@@ -4,7 +4,7 @@ import threading
 from pathlib import Path
 
 from stream_dmr.messages import FishCrop, Message
-from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.measure_source import MessageFlow
 from stream_dmr.pipeline.run_inputs import checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
@@ -38,14 +38,13 @@ def test_everyone_takes_what_the_next_stage_gets(tmp_path: Path):
             passed_on.append(taken := flow.take(message))
             return taken
 
-        run_chain(
+        Chain(
             inputs.reader,
             session.nodes,
             on_message=on_message,
             on_frame=flow.frame_done,
             stop=threading.Event(),
-            in_one_thread=True,
-        )
+        ).run(in_one_thread=True)
         flow.finish()
         kept = outputs.store.estimates()
     inputs.reader.close()

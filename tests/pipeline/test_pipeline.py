@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame, Message, TrackEnded
-from stream_dmr.pipeline.chain import Chain, StageCounters, run_chain
+from stream_dmr.pipeline.chain import Chain, StageCounters
 
 BLACK = np.zeros((2, 2, 3), np.uint8)
 
@@ -107,8 +107,8 @@ def test_the_end_of_a_track_goes_down_the_chain_and_is_told_once(in_one_thread: 
             return [frame(message.frame_index, source=self.name)]
 
     nodes = [EndsEven("first"), Repeat("without"), Answers("last")]
-    run_chain(
-        frames(6), nodes, on_message=take, stop=threading.Event(), in_one_thread=in_one_thread
+    Chain(frames(6), nodes, on_message=take, stop=threading.Event()).run(
+        in_one_thread=in_one_thread
     )
     assert ended == [2, 4, 6]
     assert answers == [("last.end", 2), ("last.end", 4), ("last.end", 6)]
@@ -125,22 +125,22 @@ class EndsAtPauses(EndsEven):
 
 
 def test_a_pause_of_the_source_ends_tracks_and_is_no_frame():
-    chains, written, done = list[Chain](), list[Message](), list[int]()
+    written, done = list[Message](), list[int]()
 
     def source() -> Iterator[Frame]:
         for item in frames(5):
             yield item
             if item.frame_index == 3:
-                chains[0].pause()
+                chain.pause()
 
-    counters = run_chain(
+    chain = Chain(
         source(),
         [EndsAtPauses("first"), EndsEven("last")],
         on_message=lambda message: written.append(message) or message,
-        on_start=chains.append,
         on_frame=lambda: done.append(1),
         stop=threading.Event(),
     )
+    counters = chain.run()
     ends = [m.source for m in written if isinstance(m, Frame) and m.source.endswith("end")]
     assert [m.cause for m in written if isinstance(m, TrackEnded)].count("pause") == 1
     assert ends == ["last.end"]
@@ -158,12 +158,8 @@ def test_each_stage_sends_what_it_would_alone_in_the_same_order(count, shapes, i
         return [Repeat(f"n{i}", copies=c, owes=o) for i, (c, o) in enumerate(shapes)]
 
     recorded = Recorded()
-    counters = run_chain(
-        frames(count),
-        nodes(),
-        on_message=recorded,
-        stop=threading.Event(),
-        in_one_thread=in_one_thread,
+    counters = Chain(frames(count), nodes(), on_message=recorded, stop=threading.Event()).run(
+        in_one_thread=in_one_thread
     )
     expected = reference(count, nodes())
     for stage, messages in expected.items():
@@ -184,19 +180,19 @@ def test_the_next_stage_gets_what_the_recorder_returns():
             seen.append(message.frame_index)
             return []
 
-    run_chain(frames(3), [Last("last")], on_message=lossy, stop=threading.Event())
+    Chain(frames(3), [Last("last")], on_message=lossy, stop=threading.Event()).run()
     assert seen == [101, 102, 103]
 
 
 def test_every_frame_is_reported_when_it_has_left_the_chain():
     done = []
-    run_chain(
+    Chain(
         frames(5),
         [Repeat("a"), Repeat("b", copies=0)],
         on_message=lambda message: message,
         on_frame=lambda: done.append(1),
         stop=threading.Event(),
-    )
+    ).run()
     assert len(done) == 5
 
 
@@ -219,7 +215,7 @@ def test_the_source_waits_for_a_slow_stage():
             finished += 1
 
     nodes = [Repeat("quick"), Repeat("slow", delay_s=0.002), Repeat("last")]
-    run_chain(source(), nodes, on_message=lambda m: m, on_frame=done, stop=threading.Event())
+    Chain(source(), nodes, on_message=lambda m: m, on_frame=done, stop=threading.Event()).run()
     assert max(ahead) < 15
 
 
@@ -231,12 +227,11 @@ def endless() -> Iterator[Frame]:
 
 
 def test_stop_drops_what_waits_before_the_slow_stage_and_finishes_what_came_after_it():
-    stop, recorded, chains = threading.Event(), Recorded(), list[Chain]()
+    stop, recorded = threading.Event(), Recorded()
 
     class Fit(Repeat):
         def step(self, message: Message) -> Sequence[Message]:
             while message.frame_index == 3 and not stop.is_set():
-                (chain,) = chains
                 # The queues before it are full, and none has been busy longer.
                 others = [chain.counters[stage].busy_s for stage in (0, 1, 3)]
                 if chain.waiting()[:2] == [2, 2] and chain.longest_busy_s() > max(others):
@@ -245,7 +240,8 @@ def test_stop_drops_what_waits_before_the_slow_stage_and_finishes_what_came_afte
             return super().step(message)
 
     nodes = [Repeat("crop", copies=2), Fit("fit", owes=True), Repeat("last", owes=True)]
-    run_chain(endless(), nodes, on_message=recorded, on_start=chains.append, stop=stop)
+    chain = Chain(endless(), nodes, on_message=recorded, stop=stop)
+    chain.run()
     fitted = recorded.of("fit") + recorded.of("fit.tick") + recorded.of("fit.close")
     assert sorted(recorded.of("last")) == sorted(fitted)  # nothing fitted was lost
     assert len(recorded.of("fit")) < len(recorded.of("crop"))  # and what waited was dropped
@@ -264,7 +260,7 @@ def test_stop_does_not_wait_for_a_camera_that_hangs():
 
     nodes = [Repeat("a", owes=True)]
     recorded = Recorded()
-    run_chain(source(), nodes, on_message=recorded, stop=stop)
+    Chain(source(), nodes, on_message=recorded, stop=stop).run()
     assert not woke.is_set()
     hangs.set()
     assert recorded.of("a.close") == [0]
@@ -292,12 +288,8 @@ def test_an_exception_in_a_node_comes_out_after_everything_before_it_was_finishe
     nodes[position] = Broken(nodes[position].name, owes=True)
     recorded = Recorded()
     with pytest.raises(BrokenError, match="third"):
-        run_chain(
-            endless(),
-            nodes,
-            on_message=recorded,
-            stop=threading.Event(),
-            in_one_thread=in_one_thread,
+        Chain(endless(), nodes, on_message=recorded, stop=threading.Event()).run(
+            in_one_thread=in_one_thread
         )
     name = nodes[position].name
     assert recorded.of(name)[-1] == 2
@@ -315,12 +307,8 @@ def test_an_exception_in_the_source_loses_nothing_that_was_read(in_one_thread: b
     recorded = Recorded()
     nodes = [Repeat("a"), Repeat("b", delay_s=0.01), Repeat("c", owes=True)]
     with pytest.raises(BrokenError):
-        run_chain(
-            source(),
-            nodes,
-            on_message=recorded,
-            stop=threading.Event(),
-            in_one_thread=in_one_thread,
+        Chain(source(), nodes, on_message=recorded, stop=threading.Event()).run(
+            in_one_thread=in_one_thread
         )
     assert recorded.of("c") == [1, 2, 3, 4, 5, 6, 7]
     assert recorded.of("c.close") == [0]
@@ -336,7 +324,7 @@ def test_an_exception_in_the_recorder_ends_the_chain(stage):
 
     nodes = [Repeat("a"), Repeat("b", owes=True)]
     with pytest.raises(BrokenError, match="disk full"):
-        run_chain(frames(9), nodes, on_message=full, stop=threading.Event())
+        Chain(frames(9), nodes, on_message=full, stop=threading.Event()).run()
     assert [node.closed for node in nodes] == [1, 1]
 
 
@@ -361,28 +349,26 @@ def test_frames_in_are_processed_dropped_or_failed(
         for k, (delay, is_broken) in enumerate(shapes)
     ]
     stop, done = threading.Event(), []
-    chains: list[Chain] = []
 
     def on_frame() -> None:
         done.append(1)
         if len(done) == (stop_at or 12):
             stop.set()
 
-    run_chain(
+    chain = Chain(
         endless() if is_endless else frames(count),
         nodes,
         on_message=lambda m: m,
         on_frame=on_frame,
-        on_start=chains.append,
         on_failure=lambda stage, error: True,
         stop=stop,
-        in_one_thread=in_one_thread,
     )
-    assert_counted(chains[0].counters)
-    assert chains[0].counters[-1].frames_processed <= len(done)
+    chain.run(in_one_thread=in_one_thread)
+    assert_counted(chain.counters)
+    assert chain.counters[-1].frames_processed <= len(done)
     if not is_endless and stop_at is None:
-        assert [c.frames_in for c in chains[0].counters] == [count] * (1 + len(nodes))
-        assert sum(c.frames_dropped for c in chains[0].counters) == 0
+        assert [c.frames_in for c in chain.counters] == [count] * (1 + len(nodes))
+        assert sum(c.frames_dropped for c in chain.counters) == 0
 
 
 @pytest.mark.parametrize("position", [0, 1, 2])
@@ -395,9 +381,9 @@ def test_a_frame_that_breaks_a_stage_is_lost_alone_where_that_is_allowed(positio
         failures.append((stage, str(error)))
         return True
 
-    counters = run_chain(
+    counters = Chain(
         frames(7), nodes, on_message=recorded, on_failure=on_failure, stop=threading.Event()
-    )
+    ).run()
     assert_counted(counters)
     assert failures == [("Broken", "third")]
     assert [one.frames_failed for one in counters[1:]] == [int(k == position) for k in range(3)]
@@ -406,10 +392,8 @@ def test_a_frame_that_breaks_a_stage_is_lost_alone_where_that_is_allowed(positio
 
 def test_an_exception_leaves_the_counters_right():
     nodes = [Repeat("a", delay_s=0.002), Broken("b"), Repeat("c", delay_s=0.004)]
-    chains: list[Chain] = []
+    chain = Chain(endless(), nodes, on_message=lambda m: m, stop=threading.Event())
     with pytest.raises(BrokenError):
-        run_chain(
-            endless(), nodes, on_message=lambda m: m, on_start=chains.append, stop=threading.Event()
-        )
-    assert_counted(chains[0].counters)
-    assert chains[0].counters[2].frames_failed == 1
+        chain.run()
+    assert_counted(chain.counters)
+    assert chain.counters[2].frames_failed == 1
