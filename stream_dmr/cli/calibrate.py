@@ -144,12 +144,7 @@ def _squarely(
 
 
 def _with_known_lens(
-    lens: Path,
-    name: str | None,
-    *,
-    plane: Path,
-    board: "PrintedBoard",
-    out: Path,
+    lens: Path, name: str | None, *, plane: Path, board: "PrintedBoard", out: Path
 ) -> None:
     from stream_dmr.calibration.board import calibrate_plane
     from stream_dmr.calibration.calibration_file import save_calibration
@@ -259,8 +254,7 @@ def check(
     square_mm: SquareOption = 25.0,
     marker_mm: MarkerOption = None,
     ends: Annotated[
-        str | None,
-        typer.Option(help="Ends of a rod, px, instead of a board.", metavar="U,V,U,V"),
+        str | None, typer.Option(help="Ends of a rod, px, instead of a board.", metavar="U,V,U,V")
     ] = None,
     length_mm: Annotated[float | None, "Length of the rod in mm."] = None,
     limit: Annotated[

@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import (
-    OverwriteOption,
-    command_line,
-    importing,
-    stop_on_signals,
-)
+from stream_dmr.cli.shared_options import OverwriteOption, command_line, importing, stop_on_signals
 from stream_dmr.pipeline.run_options import KeyOption, RunOptions
 
 if TYPE_CHECKING:

@@ -88,17 +88,10 @@ def learn_template(
     header = opened[0].header
     settings = settings_of(config, header.config_toml, recordings[0])
     mesh, forms = load_shapes(
-        template,
-        are_lying=settings.localize.rests_on_plane,
-        on_notice=lambda line: warn([line]),
+        template, are_lying=settings.localize.rests_on_plane, on_notice=lambda line: warn([line])
     )
     forms = forms or mesh_form(mesh)
-    setup = Setup(
-        config=settings,
-        template=mesh,
-        candidates=forms,
-        calibration=header.calibration,
-    )
+    setup = Setup(config=settings, template=mesh, candidates=forms, calibration=header.calibration)
     with Progress(transient=True) as progress:
         task = progress.add_task("looking for fish that are completely visible", total=None)
         stocks = setup.learn(

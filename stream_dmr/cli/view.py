@@ -21,10 +21,7 @@ from stream_dmr.cli.shared_options import (
 if TYPE_CHECKING:
     from stream_dmr.recording.selection import Selection
 
-_Source = Annotated[
-    str | None,
-    "The clip that was recorded, for pictures recorded by reference.",
-]
+_Source = Annotated[str | None, "The clip that was recorded, for pictures recorded by reference."]
 
 
 def view(

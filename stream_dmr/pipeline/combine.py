@@ -29,12 +29,7 @@ from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.session import Setup
 from stream_dmr.reasons import Reason
 from stream_dmr.recording.header import RunHeader, SecondCamera
-from stream_dmr.recording.reading import (
-    Recording,
-    decoded_messages,
-    messages_of,
-    open_recordings,
-)
+from stream_dmr.recording.reading import Recording, decoded_messages, messages_of, open_recordings
 from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, Topics
 
 _MOST_APART_S = 0.25  # between two pictures of a fish, to interpolate between them

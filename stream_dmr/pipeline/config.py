@@ -88,8 +88,7 @@ class WatchSettings(Settings):
         description="address to listen on; any but this machine's own needs a token",
     )
     token_file: str = Field(
-        default="",
-        description='file with the access token; "": no token, on this machine only',
+        default="", description='file with the access token; "": no token, on this machine only'
     )
     stuck_s: float = Field(
         default=120.0,

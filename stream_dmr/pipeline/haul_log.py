@@ -16,15 +16,7 @@ from stream_dmr.sources.sensors_settings import utc_ns_of
 from stream_dmr.store.fish import database_of, read_runs
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.schema import HAULS, WATCHED, add_row, read_rows
-from stream_dmr.store.trip import (
-    END,
-    START,
-    Haul,
-    haul_at,
-    haul_values,
-    hauls_of,
-    next_name,
-)
+from stream_dmr.store.trip import END, START, Haul, haul_at, haul_values, hauls_of, next_name
 
 _RULE = "rule"
 _FAST_NS = 60_000_000_000  # time that the vessel must be fast; chosen

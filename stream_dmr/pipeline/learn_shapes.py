@@ -40,14 +40,7 @@ from stream_dmr.fitting.shape.candidates import (
 )
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.shape.stocks import FRAMES_PER_FISH, MAX_FISH, GoodCrops, evenly, good_crops
-from stream_dmr.messages import (
-    FishCrop,
-    Frame,
-    LearntShapes,
-    LengthEstimate,
-    Message,
-    TrackEnded,
-)
+from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message, TrackEnded
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
@@ -94,10 +87,7 @@ class MeshComparison:
 
 
 def compare_with_mesh(
-    crops: Sequence[FishCrop],
-    setup: Setup,
-    *,
-    progress: Callable[[str], None] = lambda step: None,
+    crops: Sequence[FishCrop], setup: Setup, *, progress: Callable[[str], None] = lambda step: None
 ) -> MeshComparison:
     """Compare the template with the fish of these crops, in the order of their capture.
 
@@ -252,10 +242,7 @@ def mesh_fits_fish(crops: Sequence[FishCrop], setup: Setup, observer: RunObserve
 
 
 def _learn_and_report(
-    crops: Iterable[FishCrop],
-    setup: Setup,
-    forms: CandidateShapes,
-    observer: RunObserver,
+    crops: Iterable[FishCrop], setup: Setup, forms: CandidateShapes, observer: RunObserver
 ) -> CandidateShapes:
     """The stocks of all fish; `forms` if no fish is seen whole, or no stock can be of fish."""
     stocks = setup.learn(

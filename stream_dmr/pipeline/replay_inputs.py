@@ -230,10 +230,7 @@ def read_inputs(
 
 
 def new_header(
-    request: ReplayOptions,
-    recorded: RunHeader,
-    inputs: ReplayInputs,
-    second: SecondCamera | None,
+    request: ReplayOptions, recorded: RunHeader, inputs: ReplayInputs, second: SecondCamera | None
 ) -> RunHeader:
     given: dict[str, str | Path | None] = {"calibration": request.calibration}
     if inputs.files is not None:  # crops are cut again

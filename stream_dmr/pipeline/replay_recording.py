@@ -297,11 +297,7 @@ def replay(
         observer.begin(None)
         began = time.perf_counter()
         counters = Chain(
-            frames,
-            session.nodes,
-            on_message=writer.write,
-            on_frame=on_frame,
-            stop=stop,
+            frames, session.nodes, on_message=writer.write, on_frame=on_frame, stop=stop
         ).run(in_one_thread=_is_light(request))
         writer.finish()
     comparator.finish()

@@ -116,8 +116,7 @@ STAGES: Mapping[Stage, StageNode] = {
         ),
     ),
     "localize": StageNode(
-        LocalizedFish,
-        lambda setup: Localize(setup.config.localize, calibration=setup.calibration),
+        LocalizedFish, lambda setup: Localize(setup.config.localize, calibration=setup.calibration)
     ),
     "smooth": StageNode(
         LengthEstimate,

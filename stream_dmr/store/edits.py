@@ -260,10 +260,7 @@ class ReviewedMessages:
     """
 
     def __init__(
-        self,
-        recording: Recording,
-        database: Path | None = None,
-        selection: Selection = EVERYTHING,
+        self, recording: Recording, database: Path | None = None, selection: Selection = EVERYTHING
     ) -> None:
         """`selection` by the numbers that fish have after the review."""
         self._recording, self._selection = recording, selection

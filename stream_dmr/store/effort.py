@@ -61,10 +61,7 @@ def watched_times(database: Path) -> list[int]:
 
 
 def _effort(
-    name: str,
-    watched: Sequence[Mapping[str, Any]],
-    shares: Sequence[float],
-    fish: Sequence[Fish],
+    name: str, watched: Sequence[Mapping[str, Any]], shares: Sequence[float], fish: Sequence[Fish]
 ) -> HaulEffort:
     """`shares` (for each row of `watched`, 0 to 1): the part of each watched time in the haul."""
     parts = list(zip(watched, shares, strict=True))

@@ -144,12 +144,7 @@ def read_fish(path: Path, recording: Recording, selection: Selection = EVERYTHIN
         ]
     facts, track = run_facts(recording.header), recorded_track(recording)
     return [
-        Fish(
-            estimate=estimate,
-            facts=facts,
-            run_id="",
-            where=track.at(middle_ns(estimate)),
-        )
+        Fish(estimate=estimate, facts=facts, run_id="", where=track.at(middle_ns(estimate)))
         for estimate in messages_of(recording, LengthEstimate, selection)
         if estimate.is_final
     ]

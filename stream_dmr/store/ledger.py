@@ -134,9 +134,7 @@ def make_key(path: Path) -> Path:
     """
     key, public = Ed25519PrivateKey.generate(), path.with_name(f"{path.name}.pub")
     private = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     shared = key.public_key().public_bytes(
         serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo

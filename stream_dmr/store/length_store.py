@@ -19,14 +19,7 @@ from uuid import uuid4
 from stream_dmr.errors import OutputError
 from stream_dmr.files import FolderLock, ReservedSpace
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.store.ledger import (
-    END,
-    FILE_KINDS,
-    STATE,
-    Signer,
-    lines_sha256,
-    read_chain,
-)
+from stream_dmr.store.ledger import END, FILE_KINDS, STATE, Signer, lines_sha256, read_chain
 from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
     CHECKS,

@@ -363,11 +363,7 @@ def copy_in_memory(path: Path) -> sqlite3.Connection:
 
 def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.Connection:
     database = sqlite3.connect(
-        address,
-        uri=True,
-        timeout=_LOCK_TIMEOUT_S,
-        isolation_level=None,
-        check_same_thread=False,
+        address, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None, check_same_thread=False
     )
     # Text that is no UTF-8 is read as other text, not an end to all reading.
     database.text_factory = partial(str, encoding="utf-8", errors="backslashreplace")
