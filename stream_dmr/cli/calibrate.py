@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
     from stream_dmr.calibration.board import BoardResult
     from stream_dmr.calibration.corners import PrintedBoard
+    from stream_dmr.calibration.known_length import ScaleError
     from stream_dmr.calibration.lens import LensModel
+    from stream_dmr.camera import Calibration
 
 
 def calibrate(
@@ -154,13 +156,12 @@ def _with_known_lens(
     save_calibration(out, calibration)
     camera = calibration.camera
     model = "fisheye" if camera.is_fisheye else "pinhole"
-    for line in (
+    print(
         f"{model} lens of {lens}, {camera.width}x{camera.height} px; board in {plane.name}: "
-        f"{view.rms_px:.3f} px RMS, distances {view.distances.mean_percent:.2f} % off",
-        f"reference plane {view.plane.distance_mm:.0f} mm from the camera",
-        f"calibration: {out}",
-    ):
-        print(line)
+        f"{view.rms_px:.3f} px RMS, distances {view.distances.mean_percent:.2f} % off"
+    )
+    print(f"reference plane {view.plane.distance_mm:.0f} mm from the camera")
+    print(f"calibration: {out}")
 
 
 def _from_photographs(
@@ -234,13 +235,6 @@ def _summary(result: "BoardResult") -> list[str]:
         *(f"warning: {warning}" for warning in result.warnings),
     ]
 
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from stream_dmr.calibration.corners import PrintedBoard
-    from stream_dmr.calibration.known_length import ScaleError
-    from stream_dmr.camera import Calibration
 
 _MAX_PICTURES = 100  # of a clip or a camera, in which the board is looked for; chosen
 

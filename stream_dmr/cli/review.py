@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import stop_on_signals, warn
+from stream_dmr.cli.shared_options import FisheriesOption, PicturesOption, stop_on_signals, warn
 
 _Folders = Annotated[
     list[Path], typer.Argument(help="The --out of runs or of batches.", metavar="DIR...")
@@ -19,12 +19,8 @@ def review(
     port: Annotated[
         int, typer.Option(help="Port on this machine; 0: any free one.", min=0, max=65535)
     ] = 0,
-    source: Annotated[
-        str | None,
-        "The recorded clip, for pictures of the fish.",
-        "the one that was measured, if it is still there",
-    ] = None,
-    config: Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."] = None,
+    source: PicturesOption = None,
+    config: FisheriesOption = None,
     sample: Annotated[
         int | None, typer.Option(help="Review so many fish, drawn at random, for an audit.", min=1)
     ] = None,

@@ -137,7 +137,6 @@ def setup() -> None:
     """Compile the numeric loops, so that the first run need not; a run does it by itself else."""
     from rich.console import Console
 
-    from stream_dmr.cli.shared_options import stop_on_signals
     from stream_dmr.pipeline.prepare_kernels import prepare_kernels
 
     began, console = time.monotonic(), Console(file=sys.stderr, highlight=False)

@@ -44,8 +44,12 @@ MarkerOption = Annotated[float | None, "Side of a ChArUco board's markers in mm.
 
 OverwriteOption = Annotated[bool, "Replace existing files."]
 
-
-_KIND = Parameter.KEYWORD_ONLY
+PicturesOption = Annotated[
+    str | None,
+    "The recorded clip, for pictures of the fish.",
+    "the one that was measured, if it is still there",
+]
+FisheriesOption = Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."]
 
 
 def typer_command(function: Callable[..., None]) -> Callable[..., None]:

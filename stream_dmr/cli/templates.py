@@ -10,6 +10,10 @@ import typer
 from stream_dmr.cli.shared_options import OverwriteOption, settings_of, warn
 from stream_dmr.pipeline.run_options import ConfigOption
 
+if TYPE_CHECKING:
+    from stream_dmr.messages import FishCrop
+    from stream_dmr.recording.reading import Recording
+
 
 def make_template(
     side: Annotated[Path, "Mask of a straight fish seen from the side; pixels above 0 are fish."],
@@ -48,10 +52,6 @@ def make_template(
     print(f"thickness {made.thickness:.2f} of the breadth: {made.thickness_source}")
     print(f"{out} and {out.with_suffix('.toml')}")
 
-
-if TYPE_CHECKING:
-    from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.reading import Recording
 
 _IDS = 1_000_000  # between the fish of one recording and those of the next
 
@@ -114,7 +114,7 @@ def learn_template(
         print(line)
 
 
-def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[FishCrop]":
+def crops_of(paths: list[Path], recordings: "list[Recording]") -> "Iterator[FishCrop]":
     """The crops of all recordings as reviewed, with unique ids, without rejected fish and doubles.
 
     Raises UserError if two have a frame of the same source: its fish would count twice.

@@ -5,15 +5,9 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import OverwriteOption, warn
+from stream_dmr.cli.shared_options import FisheriesOption, OverwriteOption, PicturesOption, warn
 
 _INTERRUPTED = 3  # an exit code of its own: scripts must distinguish a crash from a change
-_Source = Annotated[
-    str | None,
-    "The recorded clip, for pictures of the fish.",
-    "the one that was measured, if it is still there",
-]
-_Config = Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."]
 
 
 def verify(
@@ -84,8 +78,8 @@ def report(
         typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
     ],
     out: Annotated[Path | None, "The page to write.", "report.html in the folder"] = None,
-    source: _Source = None,
-    config: _Config = None,
+    source: PicturesOption = None,
+    config: FisheriesOption = None,
     coast: Annotated[Path | None, "Coastlines for the map, as GeoJSON in degrees."] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

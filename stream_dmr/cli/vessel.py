@@ -4,6 +4,7 @@ import json
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterable
 from datetime import date
 from getpass import getuser
 from http import HTTPStatus
@@ -14,6 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals, warn
+
+if TYPE_CHECKING:
+    from stream_dmr.web.fleet_page import BoxState
 
 _TIMEOUT_S = 10.0
 
@@ -112,12 +116,6 @@ def digest(
     print(f"{path}: {size / 1000:.1f} kB")
     if size > MAX_BYTES:
         warn([f"{path}: more than {MAX_BYTES // 1000} kB, since no fish is left out"])
-
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from stream_dmr.web.fleet_page import BoxState
 
 
 def fleet(

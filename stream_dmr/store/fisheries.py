@@ -127,7 +127,8 @@ def all_lengths(
         both = {"fork": ("total", length_mm * factor), "total": ("fork", length_mm / factor)}
         kind, other_mm = both[given]
         found[kind] = (other_mm, "")
-    for wanted in LENGTHS if species else ():
-        converted = species and converted_length(species, length_mm, given=given, wanted=wanted)
-        found |= {wanted: converted} if converted else {}
+    if species is not None:
+        for wanted in LENGTHS:
+            if converted := converted_length(species, length_mm, given=given, wanted=wanted):
+                found[wanted] = converted
     return found
