@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from stream_dmr.cli.shared_options import FisheriesOption, PicturesOption, stop_on_signals, warn
+from stream_dmr.errors import UserError
 
 _Folders = Annotated[
     list[Path], typer.Argument(help="The --out of runs or of batches.", metavar="DIR...")
@@ -36,7 +37,6 @@ def review(
     with stop_on_signals() as stop:
         from getpass import getuser
 
-        from stream_dmr.errors import UserError
         from stream_dmr.web.open_reports import open_folders
         from stream_dmr.web.review_queue import AuditSample, ReviewQueue, ReviewServer
 

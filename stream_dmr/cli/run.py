@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, importing, stop_on_signals
+from stream_dmr.errors import OutputError
 from stream_dmr.pipeline.run_options import KeyOption, RunOptions
 
 if TYPE_CHECKING:
@@ -105,7 +106,6 @@ def demo(
 
 def _is_of_demo(out: Path) -> bool:
     """True if all results in a folder are from earlier demos."""
-    from stream_dmr.errors import OutputError
     from stream_dmr.store.fish import database_of, read_runs
 
     database = database_of(out)

@@ -20,12 +20,12 @@ import typer
 
 from stream_dmr.errors import UserError
 from stream_dmr.pipeline.run_options import without_password
+from stream_dmr.recording.selection import Selection
 
 if TYPE_CHECKING:
     import numpy as np
 
     from stream_dmr.pipeline.config import Config
-    from stream_dmr.recording.selection import Selection
 
 TimeOption = Annotated[
     str | None, typer.Option("--time", help="Only this time of capture, in s.", metavar="FROM:TO")
@@ -125,9 +125,7 @@ def warn(lines: Iterable[str]) -> None:
         print(f"warning: {line}", file=sys.stderr)
 
 
-def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
-    from stream_dmr.recording.selection import Selection
-
+def parse_selection(time: str | None, track: list[int] | None) -> Selection:
     time_s = None if time is None else _parse_time(time)
     return Selection.from_seconds(time_s, frozenset(track) if track else None)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, settings_of, warn
+from stream_dmr.errors import OutputError, TemplateError, UserError
 from stream_dmr.pipeline.run_options import ConfigOption
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ def make_template(
     The fish may lie in any direction, its head to either side; both masks may have any scale. Then
     measure with --template OUT.
     """
-    from stream_dmr.errors import OutputError
     from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.template.from_masks import template_from_masks
     from stream_dmr.template.template_file import save_template
@@ -74,7 +74,6 @@ def learn_template(
     """
     from rich.progress import Progress
 
-    from stream_dmr.errors import OutputError, TemplateError
     from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.fitting.shape.candidates import describe, load_shapes, mesh_form
     from stream_dmr.pipeline.learn_shapes import save_stocks, stock_paths
@@ -119,7 +118,6 @@ def crops_of(paths: list[Path], recordings: "list[Recording]") -> "Iterator[Fish
 
     Raises UserError if two have a frame of the same source: its fish would count twice.
     """
-    from stream_dmr.errors import UserError
     from stream_dmr.messages import FishCrop
     from stream_dmr.store.edits import ReviewedMessages
     from stream_dmr.store.fish import database_of, read_stored_fish

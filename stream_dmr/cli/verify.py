@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from stream_dmr.cli.shared_options import FisheriesOption, OverwriteOption, PicturesOption, warn
+from stream_dmr.errors import UserError
 
 _INTERRUPTED = 3  # an exit code of its own: scripts must distinguish a crash from a change
 
@@ -25,7 +26,6 @@ def verify(
     Exit code 1: something was changed. 3: nothing but what an interrupted run leaves, or one that
     goes on.
     """
-    from stream_dmr.errors import UserError
     from stream_dmr.evidence.digest_file import read_digest
     from stream_dmr.evidence.verify_folder import Change, summary
     from stream_dmr.evidence.verify_folder import verify as verify_folder

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals, warn
+from stream_dmr.errors import UserError, reason_of
 
 if TYPE_CHECKING:
     from stream_dmr.web.fleet_page import BoxState
@@ -37,8 +38,6 @@ def haul(
     token_file: Annotated[Path | None, "The access token of the status page."] = None,
 ) -> None:
     """Begin or end a haul; its fish are those whose middle frame lies in it."""
-    from stream_dmr.errors import UserError
-
     if target.startswith(("http://", "https://")):
         if at is not None:
             raise UserError(
@@ -59,7 +58,6 @@ def haul(
 
 
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
-    from stream_dmr.errors import UserError, reason_of
     from stream_dmr.files import read_secret
 
     headers = {"Content-Type": "application/json"}
@@ -101,7 +99,6 @@ def digest(
     It has the fish, hauls, positions, hours watched, alarms, hashes of the recordings, and small
     pictures of as many fish as there is room for. `fleet` shows it, `verify --key` checks it.
     """
-    from stream_dmr.errors import UserError
     from stream_dmr.evidence.own_files import is_made_by, require_writable
     from stream_dmr.store.ledger import Signer
     from stream_dmr.web.day_digest import MAX_BYTES, digest_name, write_digest
@@ -140,7 +137,6 @@ def fleet(
     A box that does not answer is shown with what it said last, which is kept in a .json of the
     page's name. The page needs no server; with --every, Ctrl-C ends it.
     """
-    from stream_dmr.errors import UserError
     from stream_dmr.evidence.own_files import is_made_by, require_writable
     from stream_dmr.web.fleet_page import (
         ask_all,

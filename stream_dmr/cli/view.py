@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -17,9 +17,8 @@ from stream_dmr.cli.shared_options import (
     parse_selection,
     warn,
 )
-
-if TYPE_CHECKING:
-    from stream_dmr.recording.selection import Selection
+from stream_dmr.errors import RecordingError, UserError
+from stream_dmr.recording.selection import Selection
 
 _Source = Annotated[str | None, "The clip that was recorded, for pictures recorded by reference."]
 
@@ -66,9 +65,8 @@ def view(
             viewer.show(rrd)
 
 
-def _require_frame(recording: Path, frame_index: int, selection: "Selection") -> None:
+def _require_frame(recording: Path, frame_index: int, selection: Selection) -> None:
     """Raise UserError if a recording lacks a frame; a view without messages may have it."""
-    from stream_dmr.errors import RecordingError
     from stream_dmr.recording.reading import open_recordings, require_frame
 
     try:
@@ -93,7 +91,6 @@ def convert(
     rrd = out or (
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
-    from stream_dmr.errors import UserError
     from stream_dmr.evidence.own_files import require_writable
 
     require_writable(rrd, overwrite=overwrite)
@@ -107,11 +104,10 @@ def _convert(
     recording: Path,
     rrd: Path,
     source: str | None,
-    selection: "Selection",
+    selection: Selection,
     *,
     full_size: bool = False,
 ) -> None:
-    from stream_dmr.errors import RecordingError
     from stream_dmr.recording.frame_images import open_pictures, open_recorded_source
     from stream_dmr.recording.reading import open_recordings, recorded_settings
     from stream_dmr.recording.rerun.viewer import EVERY_FRAME
@@ -141,7 +137,7 @@ def _convert(
 
 
 @contextmanager
-def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Generator[str]:
+def _as_rrd(recording: str, source: str | None, selection: Selection) -> Generator[str]:
     """The given .rrd or address; for an .mcap, a part, or with a source, a new .rrd."""
     if "://" in recording:
         yield recording
