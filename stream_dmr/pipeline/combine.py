@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
+from stream_dmr.fitting.shape.stocks import evenly
 from stream_dmr.fitting.two_masks import CommonMesh, Sight, TwoMaskFitter
 from stream_dmr.localization.localize_fish import LocalizeSettings, localize, mask_std_ratio
 from stream_dmr.localization.two_views import (
@@ -193,8 +194,7 @@ def pair_up(
     Every offset up to 10 s is tried in steps of half a frame, then finer around the best. If one
     camera's track broke off and continued as another track, both are the other camera's fish.
     """
-    chosen = np.unique(np.linspace(0, len(first) - 1, _COMPARED).round().astype(int))
-    some = {fish: first[fish] for fish in np.array([*first])[chosen].tolist()}
+    some = {fish: first[fish] for fish in evenly([*first], _COMPARED)}
 
     def cost(offset_s: float) -> float:
         apart = _apart(some, second, calibrations, offset_s)
@@ -239,7 +239,7 @@ def _apart(
     others = [*second.values()]
     begins, ends = (np.array([other.times_ns[n] for other in others]) for n in (0, -1))
     for row, track in enumerate(first.values()):
-        chosen = np.unique(np.linspace(0, len(track.times_ns) - 1, _FRAMES).round().astype(int))
+        chosen = evenly(range(len(track.times_ns)), _FRAMES)
         times = track.times_ns[chosen] + round(offset_s * 1e9)
         ends_px = track.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
         rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)

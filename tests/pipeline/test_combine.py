@@ -272,3 +272,9 @@ def test_tracks_that_broke_off_are_parts_of_the_other_cameras_fish():
     pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)
     ids = {fish: sorted(others) for fish, others in pairing.ids.items()}
     assert ids == {1: [11], 7: [11], 2: [12, 17], 3: [13], 4: [14]}
+
+
+def test_runs_share_no_fish_if_one_camera_has_no_good_fit():
+    first, second, calibrations = tracks(np.random.default_rng(4), 35.0, 0.0)
+    assert pair_up({}, second, calibrations, frame_s=FRAME_S).ids == {}
+    assert pair_up(first, {}, calibrations, frame_s=FRAME_S).ids == {}
