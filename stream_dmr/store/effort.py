@@ -35,19 +35,20 @@ def read_effort(
     `span`: only the watched time in this span, to the five minutes of a row.
     """
     hauls = hauls_of(read_rows(database, HAULS))
-    watched = read_rows(database, WATCHED)
-    watched = [row for row in watched if span is None or span.includes(row["last_ns"])]
+    rows = read_rows(database, WATCHED)
+    watched = [row for row in rows if span is None or span.includes(row["last_ns"])]
     if hauls:
         efforts = list[HaulEffort]()
         for name in dict.fromkeys(haul.name for haul in hauls):
             named = [haul for haul in hauls if haul.name == name]  # it may begin again after others
             effort = _effort(name, watched, [_overlap(row, named) for row in watched], fish)
-            ends = {"began_ns": named[0].began_ns, "ended_ns": named[-1].ended_ns}
-            efforts.append(replace(effort, **ends))
+            began_ns, ended_ns = named[0].began_ns, named[-1].ended_ns
+            efforts.append(replace(effort, began_ns=began_ns, ended_ns=ended_ns))
         shares = [1.0 - _overlap(row, hauls) for row in watched]
         outside = _effort("", watched, shares, fish)
-        is_worth_a_row = outside.num_fish or outside.hours_watched > 1e-3
-        return [*efforts, *([outside] if is_worth_a_row else [])]
+        if outside.num_fish or outside.hours_watched > 1e-3:
+            efforts.append(outside)
+        return efforts
     by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
     return [
         _effort(name, watched, [float(by_run.get(r["run_id"]) == name) for r in watched], fish)

@@ -94,8 +94,7 @@ class LengthsTable:
         if self._store.trouble or self._store.lost:
             return
         try:
-            store = self._store
-            write_lengths(self._path, store.estimates(), store.flags())
+            write_lengths(self._path, self._store.estimates(), self._store.flags())
         except OutputError as error:
             self._refuse(error)
 
