@@ -15,13 +15,7 @@ from stream_dmr.messages import Message
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import replay as replay_recordings
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import (
-    ReplayOptions,
-    RunOptions,
-    Stage,
-    command_of,
-    options_of,
-)
+from stream_dmr.pipeline.run_options import ReplayOptions, RunOptions, Stage, command_of, options_of
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.run_tables import FishRow, FrameRow

@@ -144,12 +144,7 @@ class Reason(StrEnum):
         "`combine`: no fish is where both cameras see this one",
         "look at the masks of both; was a camera moved?",
     )
-    OUTLIER = (
-        "outlier",
-        _FRAME,
-        "the length contradicts the other frames of this fish",
-        "nothing",
-    )
+    OUTLIER = ("outlier", _FRAME, "the length contradicts the other frames of this fish", "nothing")
     LONG_ENOUGH = (
         "measured long enough",
         _FRAME,

@@ -101,12 +101,7 @@ def convert(
 
 
 def _convert(
-    recording: Path,
-    rrd: Path,
-    source: str | None,
-    selection: Selection,
-    *,
-    full_size: bool = False,
+    recording: Path, rrd: Path, source: str | None, selection: Selection, *, full_size: bool = False
 ) -> None:
     from stream_dmr.recording.frame_images import open_pictures, open_recorded_source
     from stream_dmr.recording.reading import open_recordings, recorded_settings

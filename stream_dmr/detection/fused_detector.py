@@ -92,9 +92,7 @@ class FusedDetector:
             self._looked_ns = frame.timestamp_ns
         return [
             replace(
-                found,
-                place_px=self._place(found, frame),
-                looks=_looks(found.bbox_xyxy_px, seen),
+                found, place_px=self._place(found, frame), looks=_looks(found.bbox_xyxy_px, seen)
             )
             for found in fuse(moving, seen)
         ]

@@ -11,14 +11,7 @@ from typing import Any
 from stream_dmr.errors import OutputError
 from stream_dmr.files import replacing, sha256_of
 from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
-from stream_dmr.store.ledger import (
-    FILE,
-    FOUND,
-    REMOVED,
-    Signer,
-    content_sha256,
-    lines_sha256,
-)
+from stream_dmr.store.ledger import FILE, FOUND, REMOVED, Signer, content_sha256, lines_sha256
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
 from stream_dmr.store.run_facts import RunFacts

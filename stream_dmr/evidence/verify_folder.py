@@ -424,10 +424,7 @@ def _log(
 
 
 def _recording(
-    path: Path,
-    runs: dict[str, RunFacts],
-    fish: Mapping[int, Row],
-    frames: dict[str, list[str]],
+    path: Path, runs: dict[str, RunFacts], fish: Mapping[int, Row], frames: dict[str, list[str]]
 ) -> Iterator[Change]:
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
     recording, database = open_recordings([path]), path.parent / DATABASE

@@ -200,12 +200,7 @@ class Export:
         return paths
 
     def fish(
-        self,
-        out: Path,
-        config: Config,
-        *,
-        format: TableFormat,
-        all_columns: bool = False,
+        self, out: Path, config: Config, *, format: TableFormat, all_columns: bool = False
     ) -> Path:
         """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs.
 

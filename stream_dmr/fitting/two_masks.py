@@ -156,9 +156,7 @@ class TwoMaskFitter:
         return depths_mm if (depths_mm > 0).all() else None
 
     def _starts(
-        self,
-        alone: Sequence[Float[np.ndarray, "P"]],
-        depths_mm: Float[np.ndarray, "2"],
+        self, alone: Sequence[Float[np.ndarray, "P"]], depths_mm: Float[np.ndarray, "2"]
     ) -> list[Float[np.ndarray, "X"]]:
         """Bends of either camera's fit or its mirror image, turned as any of the four is."""
         own, other = alone

@@ -76,10 +76,7 @@ def length_std_ratio(
 
 @compiled
 def _information(
-    problem: Problem,
-    parameters: Float[np.ndarray, "P"],
-    rendering: Rendering,
-    weight: float,
+    problem: Problem, parameters: Float[np.ndarray, "P"], rendering: Rendering, weight: float
 ) -> Float[np.ndarray, "P P"]:
     """Sum over the rim of w r r^T, with r the slope (P,) of each edge's middle across itself.
 

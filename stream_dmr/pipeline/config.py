@@ -369,7 +369,7 @@ _BY_TWO: dict[str, dict[str, Any]] = {
         "correlation_time_s": 0.13,
         "common_std_ratio": 0.007,
         "upward_share": 0.5,
-    },
+    }
 }
 
 

@@ -170,9 +170,7 @@ class RecordingSettings(Settings):
         "the .rrd four times as long",
     )
     segment_s: float = Field(
-        default=60.0,
-        ge=2,
-        description="duration of one recording file of a live source, s",
+        default=60.0, ge=2, description="duration of one recording file of a live source, s"
     )
     segment_mb: float = Field(
         default=512.0, ge=1, description="largest .mcap of one recording file of a live source, MB"

@@ -30,12 +30,7 @@ from stream_dmr.segmentation.crop_geometry import (
     visible_bbox,
 )
 from stream_dmr.segmentation.end_judge import missing_end
-from stream_dmr.segmentation.segmenter import (
-    SegmentedFish,
-    Segmenter,
-    resize,
-    segment_both_ways,
-)
+from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter, resize, segment_both_ways
 from stream_dmr.settings import Settings
 
 _PictureSize = Annotated[int, Field(ge=64, le=1024, multiple_of=SIZE_MULTIPLE_PX)]
@@ -269,10 +264,7 @@ def beyond_head(mask: Bool[np.ndarray, "S S"], ends: FishEnds) -> Bool[np.ndarra
 
 
 def _look(
-    view: FrameView,
-    bbox_xyxy_px: Float[np.ndarray, "4"],
-    crop_camera: Camera,
-    segmenter: Segmenter,
+    view: FrameView, bbox_xyxy_px: Float[np.ndarray, "4"], crop_camera: Camera, segmenter: Segmenter
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"], FishEnds | None]:
     """The finest picture of a crop, with its ends, and the mean probability of all its pictures."""
     width, sizes_px = crop_camera.width, view.settings.segmenter_sizes_px

@@ -57,9 +57,7 @@ class Segmenter(Protocol):
 
 
 def segment_both_ways(
-    segmenter: Segmenter,
-    image: UInt8[np.ndarray, "S S 3"],
-    bbox_xyxy_px: Float[np.ndarray, "4"],
+    segmenter: Segmenter, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
 ) -> SegmentedFish:
     """The fish in a box, with the mean probability of the image and of the mirrored one.
 

@@ -218,9 +218,7 @@ class LiveStream(Source):
 
     def _enqueue(self, picture: DecodedPicture) -> None:
         arrival = _Arrival(
-            picture=picture,
-            monotonic_ns=time.monotonic_ns(),
-            connection=self._counts.reconnects,
+            picture=picture, monotonic_ns=time.monotonic_ns(), connection=self._counts.reconnects
         )
         with self._changed:
             if not self.is_endless:

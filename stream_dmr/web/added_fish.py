@@ -50,12 +50,7 @@ def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
 
 
 def measure_boxes(
-    found: Sequence[FoundFrame],
-    drawn: Boxes,
-    *,
-    track_id: int,
-    header: RunHeader,
-    config: Config,
+    found: Sequence[FoundFrame], drawn: Boxes, *, track_id: int, header: RunHeader, config: Config
 ) -> tuple[list[AddedFrame], list[LocalizedFish], bool]:
     """Cut out, segment, fit and localize the fish of the boxes, as in `run --boxes`.
 
@@ -212,10 +207,7 @@ class TrackEditor:
         flags = [ADDED, *([] if is_original else [OTHER_PIXELS])]
         row = edited_row(fish, report.config.smooth_length, flags)
         made = replace(
-            verdict,
-            track_id=new_fish,
-            fish=json.dumps([row]),
-            frames_sha256=frames_sha256(frames),
+            verdict, track_id=new_fish, fish=json.dumps([row]), frames_sha256=frames_sha256(frames)
         )
         return TrackEdit(verdict=made, frames=frames, new_fish=new_fish)
 

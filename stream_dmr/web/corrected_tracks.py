@@ -29,20 +29,10 @@ from stream_dmr.recording.reading import messages_of
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.open_results import require_recording
 from stream_dmr.store.schema import copy_database
-from stream_dmr.store.verdicts import (
-    Verdict,
-    add_verdict,
-    read_added_frames,
-    read_verdicts,
-)
+from stream_dmr.store.verdicts import Verdict, add_verdict, read_added_frames, read_verdicts
 from stream_dmr.web.added_fish import DoubtError
 from stream_dmr.web.report_page import RunReport
-from stream_dmr.web.verdict_recorder import (
-    Point,
-    VerdictRecorder,
-    parse_verdict,
-    require_database,
-)
+from stream_dmr.web.verdict_recorder import Point, VerdictRecorder, parse_verdict, require_database
 from stream_dmr.web.views import recorded_source
 
 _MOVED_PX = 1.0  # DIVE rounds boxes and points to whole pixels

@@ -29,11 +29,7 @@ from stream_dmr.web.views import draw_views, read_tracks
 
 
 def open_report(
-    path: Path,
-    *,
-    source: str | None = None,
-    config: Path | None = None,
-    as_measured: bool = False,
+    path: Path, *, source: str | None = None, config: Path | None = None, as_measured: bool = False
 ) -> RunReport:
     """Read the report of a run's folder or of a recording; `as_measured`: without any review.
 

@@ -24,11 +24,7 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, open_pictures
-from stream_dmr.recording.reading import (
-    Recording,
-    decoded_messages,
-    recorded_settings,
-)
+from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
 from stream_dmr.recording.selection import EVERYTHING
 from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map

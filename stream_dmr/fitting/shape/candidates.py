@@ -156,10 +156,7 @@ def body_forms(template: Template, *, named: str | None, are_lying: bool) -> Can
 
 
 def load_shapes(
-    name: str,
-    *,
-    are_lying: bool = False,
-    on_notice: Callable[[str], None] = lambda notice: None,
+    name: str, *, are_lying: bool = False, on_notice: Callable[[str], None] = lambda notice: None
 ) -> tuple[Template, CandidateShapes | None]:
     """The mesh and the candidate shapes of `--template`.
 

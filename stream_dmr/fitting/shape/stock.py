@@ -139,9 +139,7 @@ class ShapeEquations(NamedTuple):
 
 
 def shape_equations(
-    problem: Problem,
-    parameters: Float[np.ndarray, "P"],
-    directions: Float[np.ndarray, "V 3 W"],
+    problem: Problem, parameters: Float[np.ndarray, "P"], directions: Float[np.ndarray, "V 3 W"]
 ) -> ShapeEquations:
     """H and g of a fit by the spine; `directions` are of its body's vertices."""
     rendering = evaluate(problem, parameters, False).rendering  # compiled once, for all

@@ -152,10 +152,7 @@ def evaluate(
 
 @inlined
 def minimise(
-    problem: Problem,
-    start: Float[np.ndarray, "P"],
-    held: Bool[np.ndarray, "P"],
-    options: Options,
+    problem: Problem, start: Float[np.ndarray, "P"], held: Bool[np.ndarray, "P"], options: Options
 ) -> Minimum:
     """Down from the start; parameters that are `held` keep their value.
 
@@ -277,10 +274,7 @@ class SizeScan(NamedTuple):
 
 
 def descend(
-    problem: Problem,
-    start: Float[np.ndarray, "P"],
-    held: Bool[np.ndarray, "P"],
-    options: Options,
+    problem: Problem, start: Float[np.ndarray, "P"], held: Bool[np.ndarray, "P"], options: Options
 ) -> Minimum:
     """`minimise`, as the scan of one size: so that it is compiled once for both."""
     # Copied, since arrays of messages are read-only: for numba another type, compiled once more.

@@ -26,10 +26,7 @@ from stream_dmr.fitting.solver.spine import SPINE, Kind, jacobian
 
 @inlined
 def pull_back(
-    body: Body,
-    kind: Kind,
-    parameters: Float[np.ndarray, "P"],
-    forces: Float[np.ndarray, "V 3"],
+    body: Body, kind: Kind, parameters: Float[np.ndarray, "P"], forces: Float[np.ndarray, "V 3"]
 ) -> Float[np.ndarray, "P"]:
     """J^T f of forces on the vertices; for the spine without the root's share, which is left at 0.
 
@@ -193,10 +190,7 @@ def _add_cross(
 
 @compiled
 def smoothness(
-    body: Body,
-    normals: Float[np.ndarray, "F 3"],
-    offsets: Float[np.ndarray, "V 3"],
-    size: float,
+    body: Body, normals: Float[np.ndarray, "F 3"], offsets: Float[np.ndarray, "V 3"], size: float
 ) -> tuple[float, float]:
     """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths.
 

@@ -113,12 +113,7 @@ def coverage(
 
 @compiled
 def _add_row(
-    grid: Float[np.ndarray, "S S"],
-    row: int,
-    xa: float,
-    xb: float,
-    height: float,
-    sign: float,
+    grid: Float[np.ndarray, "S S"], row: int, xa: float, xb: float, height: float, sign: float
 ) -> None:
     """Add the signed area right of one piece of an edge within one row of pixels."""
     size = grid.shape[1]
@@ -295,10 +290,7 @@ class Residuals(NamedTuple):
 
 @compiled
 def contour_residuals(
-    target: Target,
-    pixels: Float[np.ndarray, "V 2"],
-    visible: VisibleRim,
-    moved: RimSlopes,
+    target: Target, pixels: Float[np.ndarray, "V 2"], visible: VisibleRim, moved: RimSlopes
 ) -> Residuals:
     """Distances between rim and contour, both ways, with their slopes by the slopes in `moved`."""
     count = len(visible.edges) + len(target.contour)

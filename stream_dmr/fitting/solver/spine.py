@@ -161,10 +161,7 @@ def _turn_rows(
 
 @compiled
 def spine_nodes(
-    body: Body,
-    parameters: Float[np.ndarray, "P"],
-    L: Float[np.ndarray, "J 3 3"],
-    with_slope: bool,
+    body: Body, parameters: Float[np.ndarray, "P"], L: Float[np.ndarray, "J 3 3"], with_slope: bool
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "slopes 3 joints"]]:
     """The bent midline from its head, and its slope to the joints' parameters, or none of it."""
     num_joints, count = len(body.joints), len(body.midline)
