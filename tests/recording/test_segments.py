@@ -364,7 +364,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement of clips, killed in the middle of a fish and started again."""
     folder = tmp_path_factory.mktemp("interrupted")
     make_key(folder / "key")
-    options = write_clips(folder, num_frames=60) | {"--key": str(folder / "key")}
+    options = write_clips(folder, num_frames=44) | {"--key": str(folder / "key")}
     out = Path(options["--out"])
     arguments = [part for item in options.items() for part in item]
     killed = subprocess.run(
@@ -389,7 +389,7 @@ write = FramesTable.write
 
 def write_until_killed(table, record):
     write(table, record)
-    if record.message.frame_index == 28:
+    if record.message.frame_index == 20:
         os.kill(os.getpid(), signal.SIGKILL)
 
 FramesTable.write = write_until_killed
@@ -422,7 +422,7 @@ def write_swaying_fish(path: Path, *, num_frames: int) -> None:
     """A fish that motion finds, before a ground that GrabCutSegmenter can tell from it."""
     grains = np.random.default_rng(0).integers(120, 220, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     ground = cv2.GaussianBlur(grains, (5, 5), 0)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 7, (WIDTH, HEIGHT))
     for k in range(num_frames):
         center = round(80 + 40 * np.sin(k / 6)), 60 + k % 3
         video.write(cv2.ellipse(ground.copy(), center, (14, 40), 0, 0, 360, (40, 40, 40), -1))
