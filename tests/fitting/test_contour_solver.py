@@ -215,10 +215,7 @@ class TestNormalEquations:
 
 
 class TestDescent:
-    # Its linear blend is the same loop compiled again, for 14 seconds.
-    @pytest.mark.parametrize(
-        "kind", ["spine", pytest.param("linear-blend", marks=pytest.mark.slow)]
-    )
+    @pytest.mark.parametrize("kind", KINDS)
     @twenty
     @given(seed=seeds, size=st.sampled_from([0.0, 0.3, 1.0, 4.0]))
     def test_never_ends_above_its_start(self, kind, seed, size):

@@ -29,6 +29,7 @@ from tests.support.shapes import (
 TEMPLATE = fish_template(points=STRAIGHT)
 RIG = Rig.from_template(TEMPLATE)
 SOLVERS = ("contour", "adam")
+DEFORMATION_NAMES = ("spine", "linear-blend")
 
 
 def true_pose(seed):
@@ -202,15 +203,8 @@ class TestReports:
         assert report.stop_reason
         assert report.elapsed_ns > 0
 
-    @pytest.mark.parametrize(
-        ("deformation", "solver"),
-        [
-            ("spine", "contour"),
-            ("spine", "adam"),
-            ("linear-blend", "adam"),
-            pytest.param("linear-blend", "contour", marks=pytest.mark.slow),
-        ],
-    )
+    @pytest.mark.parametrize("solver", SOLVERS)
+    @pytest.mark.parametrize("deformation", DEFORMATION_NAMES)
     def test_shape_and_losses_follow_from_the_parameters(self, crop, solver, deformation):
         """As the torch reference has them, whatever the solver computed them with."""
         settings = FitMeshSettings(solver=solver, deformation=deformation)
