@@ -178,13 +178,13 @@ def test_a_head_that_one_camera_takes_for_the_tail_changes_no_length(scene, comb
         for sightings in (others, turned)
     ]
     num_accepted = 0
-    for mesh in [*messages_of(first, FittedMesh)][::3]:
+    for mesh in messages_of(first, FittedMesh):
         (straight,), (swapped,) = (node.step(mesh) for node in nodes)
         if straight.accepted:
             num_accepted += 1
             assert swapped.accepted
             assert swapped.length_mm == pytest.approx(straight.length_mm, rel=1e-3)
-    assert num_accepted > 6
+    assert num_accepted > 20
 
 
 def test_a_poor_fit_by_one_camera_counts_where_a_mesh_fits_both_masks(scene, combined, tmp_path):
