@@ -116,9 +116,8 @@ def main() -> None:
     arguments = parser.parse_args()
     sources: dict[str, list[AnnotatedImage]] = defaultdict(list)
     for annotated in read_annotated_images(arguments.images, arguments.masks):
-        if not any(
-            map(reaches_rim, annotated.masks)
-        ):  # where a fish is cut off, the picture says nothing
+        # Where a fish is cut off, the picture says nothing.
+        if not any(map(reaches_rim, annotated.masks)):
             sources[annotated.path.stem.split("-")[0]].append(annotated)
     print(
         "| source | by | fish | measured | mean | rms | beyond 5 % | worst | held | width | none |"

@@ -65,7 +65,7 @@ class CameraMotion:
             return None
         affine = estimate_similarity(before, picture, is_background=is_background)
         if affine is None:
-            if self._explained <= _MIN_EXPLAINED * self._changed:  # not found moving so far
+            if not self._is_explained:  # not found moving so far
                 self._rest_frames = _REST_FRAMES
             return None
         moved = warp(before, affine)
@@ -73,11 +73,15 @@ class CameraMotion:
         mask = is_background.view(np.uint8)
         self._add_explained(cv2.mean(changed, mask)[0], cv2.mean(remaining, mask)[0])
         self._add_unmoved(_cell_means(changed), _cell_means(cv2.absdiff(before, moved)))
-        is_explained = self._explained > _MIN_EXPLAINED * self._changed
         is_at_rest = np.mean(self._unmoved > 0.5 * self._predicted) > _MAX_UNMOVED_CELLS
         if is_at_rest:
             self._rest_frames = _REST_FRAMES
-        return affine if is_explained and not is_at_rest else None
+        return affine if self._is_explained and not is_at_rest else None
+
+    @property
+    def _is_explained(self) -> bool:
+        """True if motion explains most of the changes of late."""
+        return self._explained > _MIN_EXPLAINED * self._changed
 
     def _add_explained(self, changed: float, remaining: float) -> None:
         """Add how much of the change the motion explains; large changes weigh more than noise."""
@@ -302,26 +306,11 @@ def _regions(
 
     They are as wide as the picture, but as many as the regions; `_distance` has what lies between.
     """
-    rows = _with_precision(light, moments).reshape(-1, light.shape[1])
+    a, b, c = (variance + _SENSOR_VARIANCE for variance in cv2.split(moments[0]))
+    d, e, f = cv2.split(moments[1])
+    adjugate = [b * c - f * f, a * c - e * e, a * b - d * d]
+    adjugate += [e * f - c * d, d * f - b * e, d * e - a * f]
+    determinant = a * adjugate[0] + d * adjugate[3] + e * adjugate[4]
+    layers = [*cv2.split(light), *(part / determinant for part in adjugate)]
+    rows = np.stack(layers, axis=1).reshape(-1, light.shape[1])
     return cv2.resize(rows, (width, len(rows))).reshape(-1, 9, width)
-
-
-@compiled
-def _with_precision(
-    light: Float32[np.ndarray, "h w 3"], moments: Float32[np.ndarray, "2 h w 3"]
-) -> Float32[np.ndarray, "h 9 w"]:
-    """Light, and the inverse covariance: adjugate over determinant."""
-    layers = np.empty((light.shape[0], 9, light.shape[1]), np.float32)
-    for i in range(light.shape[0]):
-        for j in range(light.shape[1]):
-            layers[i, 0, j], layers[i, 1, j], layers[i, 2, j] = light[i, j]
-            a, b, c = moments[0, i, j]
-            d, e, f = moments[1, i, j]
-            a, b, c = a + _SENSOR_VARIANCE, b + _SENSOR_VARIANCE, c + _SENSOR_VARIANCE
-            adjugate = (b * c - f * f, a * c - e * e, a * b - d * d)
-            others = (e * f - c * d, d * f - b * e, d * e - a * f)
-            determinant = a * adjugate[0] + d * others[0] + e * others[1]
-            for k in range(3):
-                layers[i, 3 + k, j] = adjugate[k] / determinant
-                layers[i, 6 + k, j] = others[k] / determinant
-    return layers
