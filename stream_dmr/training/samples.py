@@ -277,7 +277,10 @@ def _empty_box(
     if part.sum() < 40 or any((part * layer).sum() > 0.01 * part.sum() for layer in layers):
         return None
     if rng.random() < 0.8:
-        things = (draw_into(thing, overview, size=_OVERVIEW_PX)[0] for thing in scene.occluders)
+        things = (
+            draw_into(thing, overview, size=_OVERVIEW_PX)[0]
+            for thing in [*scene.ground, *scene.occluders]
+        )
         part = part * np.maximum.reduce([*things, np.zeros_like(part)])
     x, y, width, height = cv2.boundingRect((part > 0.2).astype(np.uint8))
     if max(width, height) < 8:

@@ -205,6 +205,11 @@ def _noise(rng: np.random.Generator, grain_x: float, grain_y: float) -> Layer:
     return noise(rng, BACKGROUND_PX, BACKGROUND_PX, grain_px=(grain_x, grain_y))
 
 
+# BGR of wood, light and dark, of white, grey and yellow plastic, and of painted boards.
+_BOARDS = [
+    *([120, 175, 215], [60, 130, 205], [45, 60, 85], [230, 232, 235]),
+    *([165, 168, 168], [40, 205, 235], [170, 110, 40]),
+]
 _SUBPIXEL_BITS = 4  # of OpenCV's `shift`: coordinates in sixteenths of a pixel
 
 
@@ -239,21 +244,75 @@ def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occlud
 def draw_ruler(rng: np.random.Generator, along_rad: float) -> Occluder:
     """A ruler or a measuring tape beside the fish, along it, with its marks."""
     along, width = _direction(along_rad + rng.normal(0.0, 0.06)), rng.uniform(0.02, 0.1)
-    beside = along[::-1] * [-1.0, 1.0]  # at a right angle
     side = rng.choice([-1.0, 1.0])
-    middle = side * (rng.uniform(0.08, 0.4) + width / 2) * beside + rng.normal(0.0, 0.2) * along
-    half = rng.uniform(0.4, 1.5)
-    polygons, tones = [_strip(middle - half * along, middle + half * along, width)], [1.0]
-    edge = middle + rng.choice([-0.5, 0.5]) * width * beside
-    inwards = np.sign((middle - edge) @ beside) * rng.uniform(0.3, 0.9) * width * beside
-    mark, pitch = rng.uniform(0.1, 0.6), rng.uniform(0.03, 0.1)
-    for place in np.arange(-half + pitch, half, pitch):
-        start = edge + place * along
-        polygons.append(_strip(start, start + inwards, rng.uniform(0.1, 0.3) * pitch))
-        tones.append(mark)
+    beside = side * (rng.uniform(0.08, 0.4) + width / 2) * _across(along)
+    middle = beside + rng.normal(0.0, 0.2) * along
     yellow_or_white = [40, 205, 235] if rng.random() < 0.5 else [225, 230, 230]
     colour = np.array(yellow_or_white) * rng.uniform(0.6, 1.05)
+    return _scale(rng, middle, rng.uniform(0.4, 1.5) * along, width, colour)
+
+
+def _scale(
+    rng: np.random.Generator,
+    middle: Float[np.ndarray, "2"],
+    half: Float[np.ndarray, "2"],  # from the middle to one end
+    width: float,
+    colour: Float[np.ndarray, "3"],
+) -> Occluder:
+    """A strip with marks from one edge inwards, and perhaps dark spots for its numbers."""
+    length = np.linalg.norm(half)
+    along = half / length
+    polygons, tones = [_strip(middle - half, middle + half, width)], [1.0]
+    edge = middle + rng.choice([-0.5, 0.5]) * width * _across(along)
+    side = np.sign((middle - edge) @ _across(along)) * width * _across(along)
+    share, mark, pitch = rng.uniform(0.3, 0.9), rng.uniform(0.1, 0.6), rng.uniform(0.03, 0.1)
+    has_numbers = rng.random() < 0.5
+    for place in np.arange(-length + pitch, length, pitch):
+        start = edge + place * along
+        polygons.append(_strip(start, start + share * side, rng.uniform(0.1, 0.3) * pitch))
+        if has_numbers:
+            number = start + 0.35 * pitch * along + rng.uniform(0.3, 0.5) * side
+            polygons.append(_strip(number, number + 0.35 * side, 0.25 * pitch))
+    tones += [mark] * (len(polygons) - 1)
     return Occluder(polygons=polygons, tones=tones, colour=colour, hides=True)
+
+
+def draw_board(rng: np.random.Generator, along_rad: float) -> list[Occluder]:
+    """A measuring board or box beneath the fish, along it: floor and walls, scale, prints."""
+    along = _direction(along_rad + rng.normal(0.0, 0.05))
+    beside = _across(along)
+    axes = np.stack([rng.uniform(0.48, 1.0) * along, rng.uniform(0.08, 0.4) * beside])
+    middle = rng.normal(0.0, 0.08) * along + rng.normal(0.0, 0.03) * beside
+    corners = middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ axes
+    polygons, tones = [corners], [1.0]
+    for seam in rng.uniform(-1.0, 1.0, rng.integers(1, 5) if rng.random() < 0.3 else 0):
+        start = middle + seam * axes[1]
+        polygons.append(_strip(start - axes[0], start + axes[0], rng.uniform(0.003, 0.015)))
+        tones.append(rng.uniform(0.3, 0.8))
+    share, thick, lit = rng.choice([0.0, 0.5, 1.0]), rng.uniform(0.015, 0.09), rng.uniform(0.6, 1.4)
+    sides = [side for side in pairwise([*corners, corners[0]]) if rng.random() < share]
+    for start, end in sides if rng.random() < 0.7 else []:  # what the walls shade
+        polygons.append(_strip(start, end, thick * rng.uniform(1.3, 3.5)))
+        tones.append(rng.uniform(0.35, 0.8))
+    for start, end in sides:
+        polygons.append(_strip(start, end, thick))
+        tones.append(lit * rng.uniform(0.75, 1.3))
+    colour = np.array(_BOARDS[rng.integers(len(_BOARDS))]) * rng.uniform(0.5, 1.1)
+    if rng.random() < 0.3:
+        colour = _any_colour(rng)
+    parts = [Occluder(polygons=polygons, tones=tones, colour=colour, hides=True)]
+    for _ in range(rng.integers(0, 4) if rng.random() < 0.5 else 0):
+        half = rng.uniform(0.02, 0.08, 2)[:, None] * np.stack([along, beside])
+        at = middle + rng.uniform(-0.9, 0.9, 2) @ axes
+        print_ = _strip(at - half[0], at + half[0], 2 * float(np.linalg.norm(half[1])))
+        parts.append(Occluder(polygons=[print_], tones=[1.0], colour=_any_colour(rng), hides=True))
+    if rng.random() < 0.75:
+        place = rng.uniform(-0.9, 0.9) if rng.random() < 0.6 else rng.normal(0.0, 0.2)
+        strip = [[230, 232, 235], [40, 205, 235], colour][rng.integers(3)]
+        paint = np.clip(np.array(strip) * rng.uniform(0.7, 1.1), 0, 255)
+        width = rng.uniform(0.03, 0.15)
+        parts.append(_scale(rng, middle + place * axes[1], 0.97 * axes[0], width, paint))
+    return parts
 
 
 def draw_into(
@@ -360,12 +419,16 @@ def _bar(
     return np.concatenate([start + width / 2 * cap, end - end_width / 2 * cap])
 
 
+def _across(along: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    return along[::-1] * [-1.0, 1.0]
+
+
 def _strip(
     start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: float
 ) -> Float[np.ndarray, "4 2"]:
     """A bar with square ends."""
     along = (end - start) / (np.linalg.norm(end - start) + 1e-9)
-    beside = width / 2 * along[::-1] * [-1.0, 1.0]
+    beside = width / 2 * _across(along)
     return np.array([start + beside, end + beside, end - beside, start - beside])
 
 

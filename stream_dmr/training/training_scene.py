@@ -22,6 +22,7 @@ from stream_dmr.training.image_degradation import (
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
 from stream_dmr.training.surroundings import (
     Occluder,
+    draw_board,
     draw_into,
     draw_line,
     draw_occluders,
@@ -31,6 +32,9 @@ from stream_dmr.training.surroundings import (
 # Share of the scenes with a fish that lies close beside the target, along it: chosen by hand.
 # Without any the network took the ground between two fish as well.
 _BESIDE_SHARE = 0.12
+# Share of the scenes on a measuring board: chosen by hand. Without any, masks ran on to the walls
+# of boxes, and fish between them were not found.
+_BOARD_SHARE = 0.16
 
 
 class Fade(NamedTuple):
@@ -77,6 +81,7 @@ class SceneFish:
 class TrainingScene:
     """A scene in units of the target fish's length, with the origin at its middle."""
 
+    ground: list[Occluder]  # a measuring board below all fish, or nothing
     behind: list[SceneFish]
     target: SceneFish  # the fish that a box is put around
     before: list[SceneFish]
@@ -108,15 +113,22 @@ def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
         head_px = bank.ends_px[fish.patch][0]
         if rng.random() < 0.4 and np.isfinite(head_px).all():
             occluders.append(draw_line(rng, fish.to_scene(head_px)))
+    along = target.scene_from_patch[:, 0]
+    along_rad = float(np.arctan2(along[1], along[0]))
     if rng.random() < 0.1:  # fish lie beside rulers, which the network took for fish without these
-        along = target.scene_from_patch[:, 0]
-        occluders.append(draw_ruler(rng, float(np.arctan2(along[1], along[0]))))
+        occluders.append(draw_ruler(rng, along_rad))
+    ground = draw_board(rng, along_rad) if rng.random() < _BOARD_SHARE else []
     frame = np.array([-9.0, -9.0, 9.0, 9.0])  # edges far off; or an edge across or near the target
     if rng.random() < 0.16:
         edge = rng.integers(4)
         frame[edge] = (-1.0 if edge < 2 else 1.0) * rng.uniform(0.0, 0.6)
     return TrainingScene(
-        behind=behind, target=target, before=before, occluders=occluders, frame=frame
+        ground=ground,
+        behind=behind,
+        target=target,
+        before=before,
+        occluders=occluders,
+        frame=frame,
     )
 
 
@@ -181,6 +193,8 @@ def render_scene(
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
     """The crop (BGR), and the visible fraction of `targets` in each pixel, 0 to 1."""
     picture = _draw_backdrop(rng, bank, size_px)
+    for thing in scene.ground:
+        picture, _ = _with_thing(rng, bank, picture, thing, crop_from_scene)
     if rng.random() < _ALIKE_SHARE:
         target = warp_fish(bank, scene.target, crop_from_scene, size=size_px)
         picture = recolour_backdrop(rng, picture, target)
@@ -206,16 +220,29 @@ def render_scene(
         layer = layer if motion is None else cv2.filter2D(layer, -1, motion)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
     for occluder in scene.occluders:
-        covered, tones = draw_into(occluder, crop_from_scene, size=size_px)
+        picture, covered = _with_thing(rng, bank, picture, occluder, crop_from_scene)
         if occluder.hides:
             mask *= 1 - covered
-        grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
-        texture = grey / max(float(grey.mean()), 1.0) - 1
-        tone = tones[..., None] * (1 + np.float32(rng.uniform(0.0, 0.4)) * texture)
-        picture += covered[..., None] * (tone * occluder.colour.astype(np.float32) - picture)
     inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
     pixels = simulate_camera(rng, add_weather(rng, picture))
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
+
+
+def _with_thing(
+    rng: np.random.Generator,
+    bank: PatchBank,
+    picture: Float32[np.ndarray, "S S 3"],
+    thing: Occluder,
+    crop_from_scene: Float[np.ndarray, "2 3"],
+) -> tuple[Float32[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
+    """The picture with a thing before it, and the fraction of each pixel that this covers."""
+    size_px = len(picture)
+    covered, tones = draw_into(thing, crop_from_scene, size=size_px)
+    grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
+    texture = grey / max(float(grey.mean()), 1.0) - 1
+    tone = tones[..., None] * (1 + np.float32(rng.uniform(0.0, 0.4)) * texture)
+    colour = thing.colour.astype(np.float32)
+    return picture + covered[..., None] * (tone * colour - picture), covered
 
 
 @dataclass(frozen=True)

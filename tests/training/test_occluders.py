@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.training.surroundings import (
     Occluder,
+    draw_board,
     draw_into,
     draw_line,
     draw_occluders,
@@ -69,3 +70,24 @@ def test_a_ruler_lies_beside_the_fish_and_along_it():
         extent = np.ptp(ruler.polygons[0] @ across), np.ptp(ruler.polygons[0], axis=0).max()
         assert extent[0] < extent[1]
         assert all(1 < len(polygon) < 5 for polygon in ruler.polygons)
+
+
+def test_a_board_lies_under_the_fish_and_along_it():
+    for seed in range(40):
+        along_rad = seed * 0.3
+        floor = draw_board(np.random.default_rng(seed), along_rad)[0].polygons[0]
+        along = np.array([np.cos(along_rad), np.sin(along_rad)])
+        across = np.array([-np.sin(along_rad), np.cos(along_rad)])
+        assert (floor @ across).min() < 0 < (floor @ across).max()
+        assert np.ptp(floor @ along) > 0.9  # about as long as the fish, or longer
+        assert np.ptp(floor @ along) > np.ptp(floor @ across)
+
+
+def test_marks_of_a_board_are_on_it():
+    crop_from_scene = np.array([[30.0, 0.0, 48.0], [0.0, 30.0, 48.0]])
+    for seed in range(20):
+        floor, *prints = draw_board(np.random.default_rng(seed), 0.0)
+        board, _ = draw_into(floor, crop_from_scene, size=SIZE)
+        for thing in prints:
+            covered, _ = draw_into(thing, crop_from_scene, size=SIZE)
+            assert (covered * (board > 0.5)).sum() > 0.5 * covered.sum()

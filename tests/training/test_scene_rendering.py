@@ -8,6 +8,7 @@ import pytest
 from stream_dmr.training.image_degradation import PatchBank, make_bank
 from stream_dmr.training.random_fish import PATCH_PX
 from stream_dmr.training.samples import crop_affine
+from stream_dmr.training.surroundings import draw_board
 from stream_dmr.training.training_scene import (
     CastShadow,
     TrainingScene,
@@ -31,7 +32,7 @@ def scene_of(bank: PatchBank, seed: int) -> TrainingScene:
     """A scene of one fish, with nothing before it."""
     scene = draw_scene(np.random.default_rng(seed), bank)
     frame = np.array([-9.0, -9.0, 9.0, 9.0])
-    return replace(scene, behind=[], before=[], occluders=[], frame=frame)
+    return replace(scene, ground=[], behind=[], before=[], occluders=[], frame=frame)
 
 
 def render(bank: PatchBank, scene: TrainingScene) -> tuple[np.ndarray, np.ndarray]:
@@ -96,3 +97,11 @@ def test_a_recoloured_backdrop_comes_close_to_a_colour_of_the_fish():
     assert near < 0.6 * np.abs(backdrop.mean(axis=(0, 1)) - [20, 40, 90]).max()
     assert recoloured.std() > 0  # its texture is kept
     assert recolour_backdrop(np.random.default_rng(3), backdrop, 0 * fish) is backdrop
+
+
+def test_a_board_lies_behind_the_fish(bank: PatchBank):
+    scene = replace(scene_of(bank, 3), ground=draw_board(np.random.default_rng(3), 0.0))
+    image, mask = render(bank, scene)
+    without, mask_without = render(bank, replace(scene, ground=[]))
+    np.testing.assert_array_equal(mask, mask_without)
+    assert (image != without).any()

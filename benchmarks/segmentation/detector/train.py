@@ -30,7 +30,7 @@ from stream_dmr.training.annotated_images import cutout_patch, load_backgrounds,
 from stream_dmr.training.image_degradation import load_or_make_bank
 
 _SINGLES = ["fish_market", "caltech_bass", "milkfish_weight", "specimens", "fishial"]
-_BATCH, _RATE, _WEIGHT_DECAY = 16, 1e-3, 1e-4
+_BATCH, _WEIGHT_DECAY = 16, 1e-4
 _DECAY = 0.995  # of the running average that is kept
 _PARTS = 10
 
@@ -53,7 +53,7 @@ class _Drawn(IterableDataset[Batch]):
 
 
 def train(
-    source: FrameSource, network: OnnxModule, *, steps: int, seed: int
+    source: FrameSource, network: OnnxModule, *, steps: int, seed: int, highest_rate: float
 ) -> Iterator[OnnxModule]:
     """The averaged network after each part of the training."""
     torch.manual_seed(seed)
@@ -62,9 +62,9 @@ def train(
     batches = iter(DataLoader(_Drawn(source, seed), batch_size=None, num_workers=1))
     losses = []
     for step in range(steps):
-        rate = _RATE * min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / steps))
+        rate = min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / steps))
         for group in optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = highest_rate * rate
         pictures, boxes = next(batches)
         with torch.autocast("cpu", torch.bfloat16):
             outputs = network(pictures.contiguous(memory_format=torch.channels_last))
@@ -93,6 +93,7 @@ def main() -> None:
     parser.add_argument("--init", type=Path, help="a file of this command, to go on from")
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rate", type=float, default=1e-3, help="highest step size")
     arguments = parser.parse_args()
     learnt, held_back = read_sources(arguments.repositories)
     for name, frames in learnt.items():
@@ -119,7 +120,14 @@ def main() -> None:
     network = OnnxModule(arguments.yolox, OUTPUTS)
     if arguments.init is not None:
         go_on_from(network, arguments.init)
-    for averaged in train(source, network, steps=arguments.steps, seed=arguments.seed):
+    training = train(
+        source,
+        network,
+        steps=arguments.steps,
+        seed=arguments.seed,
+        highest_rate=arguments.rate,
+    )
+    for averaged in training:
         export_detector(averaged, arguments.out)
         for name, pictures in held_back.items():
             print(f"  {name}: {score(arguments.out, pictures).summary}", flush=True)

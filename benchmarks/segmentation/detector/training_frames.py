@@ -19,12 +19,14 @@ from benchmarks.segmentation.real_images import (
 )
 from stream_dmr.training.annotated_images import read_annotated_images
 from stream_dmr.training.image_degradation import PatchBank, add_weather, simulate_camera
+from stream_dmr.training.surroundings import draw_board, draw_into, draw_occluders
 
 SIDE_PX = 448  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
 _FRAME_SHARE, _SINGLE_SHARE = 0.45, 0.1  # of the examples; the others are put together
 _MOSAIC_SHARE, _MORE_FISH_SHARE = 0.25, 0.25  # of the examples from frames
 _TURNED_SHARE, _WATER_SHARE = 0.2, 0.3  # of all examples
+_BOARD_SHARE, _ON_BOARD_SHARE = 0.3, 0.85  # of examples put together; of boards, with a fish
 _SIZES_PX = (18.0, 560.0)  # of fish put before a background
 _MOST_FISH = 12
 _MIN_VISIBLE = 0.35  # of a fish; with less it has no box
@@ -149,8 +151,48 @@ def _composed(
     row, column = rng.integers(0, len(background) - side + 1, 2)
     part = background[row : row + side, column : column + side]
     picture = cv2.resize(part, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
+    if rng.random() < _BOARD_SHARE:
+        return _on_board(rng, picture.astype(np.float32), bank)
     count = int(rng.integers(0, _MOST_FISH + 1) if rng.random() < 0.6 else rng.integers(0, 4))
     return _with_fish(rng, picture.astype(np.float32), np.zeros((0, 4)), bank, count=count)
+
+
+def _on_board(
+    rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"], bank: PatchBank
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """A measuring board before a picture, mostly with one fish on it; perhaps a hand, a pole."""
+    length = rng.uniform(0.25, 0.9) * SIDE_PX
+    angle_deg = rng.normal(0.0, 12.0)
+    if rng.random() < 0.3:
+        angle_deg = rng.uniform(0, 360)
+    middle = rng.uniform(0.35, 0.65, 2) * SIDE_PX
+    from_scene = np.column_stack([length * np.eye(2), middle])
+    for thing in draw_board(rng, -np.radians(angle_deg)):
+        picture = _covered_by(picture, *draw_into(thing, from_scene, size=SIDE_PX), thing.colour)
+    is_fish = np.zeros((SIDE_PX, SIDE_PX), bool)
+    if rng.random() < _ON_BOARD_SHARE:
+        angle_deg += 180 * rng.integers(2)
+        layer = _fish_at(bank.fish[bank.draw_fish(rng)], length, angle_deg, middle)
+        cover = layer[..., 3:] / 255
+        picture = picture * (1 - cover) + layer[..., :3] * rng.uniform(0.7, 1.2)
+        is_fish = cover[..., 0] > 0.5
+    area = int(is_fish.sum())
+    for thing in draw_occluders(rng) if rng.random() < 0.5 else []:
+        hidden, tones = draw_into(thing, from_scene, size=SIDE_PX)
+        picture = _covered_by(picture, hidden, tones, thing.colour)
+        is_fish &= hidden < 0.5
+    is_shown = is_fish.any() and is_fish.sum() > _MIN_VISIBLE * area
+    boxes = np.array([box_of(is_fish)], np.float64) if is_shown else np.zeros((0, 4))
+    return picture.clip(0, 255).astype(np.float32), boxes
+
+
+def _covered_by(
+    picture: Float32[np.ndarray, "S S 3"],
+    covered: Float32[np.ndarray, "S S"],
+    tones: Float32[np.ndarray, "S S"],
+    colour: Float[np.ndarray, "3"],
+) -> Float32[np.ndarray, "S S 3"]:
+    return picture + covered[..., None] * (tones[..., None] * np.float32(colour) - picture)
 
 
 def _mosaic(
@@ -231,12 +273,18 @@ def _placed_fish(
 ) -> Float32[np.ndarray, "S S 4"]:
     """A fish of that length at a random place: BGR times coverage, and coverage."""
     patch = bank.fish[bank.draw_fish(rng)]
-    side = patch.shape[0]
     angle_deg = rng.normal(0.0, 25.0) + 180 * rng.integers(2)
     if rng.random() < 0.3:
         angle_deg = rng.uniform(0, 360)
+    return _fish_at(patch, size, angle_deg, rng.uniform(-0.1, 1.1, 2) * SIDE_PX)
+
+
+def _fish_at(
+    patch: UInt8[np.ndarray, "P P 4"], size: float, angle_deg: float, at: Float[np.ndarray, "2"]
+) -> Float32[np.ndarray, "S S 4"]:
+    side = patch.shape[0]
     affine = cv2.getRotationMatrix2D((side / 2, side / 2), angle_deg, size / side)
-    affine[:, 2] += rng.uniform(-0.1, 1.1, 2) * SIDE_PX - side / 2
+    affine[:, 2] += at - side / 2
     shrink = int(side / size)
     if shrink > 1:  # average pixels that would be skipped
         patch = cv2.blur(patch, (shrink, shrink))
