@@ -152,17 +152,17 @@ _OVEREXPOSED_LEVEL = 250  # grey level of every channel; brighter than any skin 
 def touches_border(
     extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...], pixel_px: float = 1.0
 ) -> bool:
-    """True if a mask is within a pixel of the edge of a frame of shape (H, W); None: False.
+    """True if a mask reaches the edge of a frame of shape (H, W); None: False.
 
     `extent`: the half-open box of the frame pixels with the centers of the mask's pixels, which are
-    `pixel_px` frame pixels wide: the mask extends half a mask pixel further. In a picture of 12
-    megapixels a mask pixel is 40 px wide.
+    `pixel_px` frame pixels wide, 40 in a picture of 12 megapixels: the mask reaches the edge if no
+    row of such pixels is between them, or within a pixel of the frame.
     """
     if extent is None:
         return False
     height, width = shape
     x0, y0, x1, y1 = extent
-    return bool(min(x0, y0, width - x1, height - y1) <= 1.5 * max(pixel_px, 1.0) - 0.5)
+    return bool(min(x0, y0, width - x1, height - y1) <= max(pixel_px - 0.5, 1.0))
 
 
 def glare(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
