@@ -156,7 +156,7 @@ def touches_border(
 
     `extent`: the half-open box of the frame pixels with the centers of the mask's pixels, which are
     `pixel_px` frame pixels wide, 40 in a picture of 12 megapixels: the mask reaches the edge if no
-    row of such pixels is between them, or within a pixel of the frame.
+    row of such pixels, or one pixel of the frame at most, is between them.
     """
     if extent is None:
         return False

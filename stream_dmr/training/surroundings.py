@@ -205,10 +205,11 @@ def _noise(rng: np.random.Generator, grain_x: float, grain_y: float) -> Layer:
     return noise(rng, BACKGROUND_PX, BACKGROUND_PX, grain_px=(grain_x, grain_y))
 
 
-# BGR of wood, light and dark, of white, grey and yellow plastic, and of painted boards.
+_WHITE, _YELLOW = [230, 232, 235], [40, 205, 235]  # BGR
+# Wood, light and dark, white, grey and yellow plastic, and paint.
 _BOARDS = [
-    *([120, 175, 215], [60, 130, 205], [45, 60, 85], [230, 232, 235]),
-    *([165, 168, 168], [40, 205, 235], [170, 110, 40]),
+    *([120, 175, 215], [60, 130, 205], [45, 60, 85], _WHITE),
+    *([165, 168, 168], _YELLOW, [170, 110, 40]),
 ]
 _SUBPIXEL_BITS = 4  # of OpenCV's `shift`: coordinates in sixteenths of a pixel
 
@@ -247,7 +248,7 @@ def draw_ruler(rng: np.random.Generator, along_rad: float) -> Occluder:
     side = rng.choice([-1.0, 1.0])
     beside = side * (rng.uniform(0.08, 0.4) + width / 2) * _across(along)
     middle = beside + rng.normal(0.0, 0.2) * along
-    yellow_or_white = [40, 205, 235] if rng.random() < 0.5 else [225, 230, 230]
+    yellow_or_white = _YELLOW if rng.random() < 0.5 else [225, 230, 230]
     colour = np.array(yellow_or_white) * rng.uniform(0.6, 1.05)
     return _scale(rng, middle, rng.uniform(0.4, 1.5) * along, width, colour)
 
@@ -308,7 +309,7 @@ def draw_board(rng: np.random.Generator, along_rad: float) -> list[Occluder]:
         parts.append(Occluder(polygons=[print_], tones=[1.0], colour=_any_colour(rng), hides=True))
     if rng.random() < 0.75:
         place = rng.uniform(-0.9, 0.9) if rng.random() < 0.6 else rng.normal(0.0, 0.2)
-        strip = [[230, 232, 235], [40, 205, 235], colour][rng.integers(3)]
+        strip = [_WHITE, _YELLOW, colour][rng.integers(3)]
         paint = np.clip(np.array(strip) * rng.uniform(0.7, 1.1), 0, 255)
         width = rng.uniform(0.03, 0.15)
         parts.append(_scale(rng, middle + place * axes[1], 0.97 * axes[0], width, paint))
@@ -330,6 +331,22 @@ def draw_into(
         covered = np.maximum(covered, part)
         tones += part * (np.float32(tone) - tones)
     return covered, tones
+
+
+def with_thing(
+    picture: Float32[np.ndarray, "S S 3"],
+    thing: Occluder,
+    crop_from_scene: Float[np.ndarray, "2 3"],
+    *,
+    texture: Float32[np.ndarray, "S S 1"] | float = 0.0,
+) -> tuple[Float32[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
+    """A crop (BGR) with a thing before it, and the fraction of each pixel that this covers.
+
+    `texture`: by how much of its light each pixel of the thing is lighter.
+    """
+    covered, tones = draw_into(thing, crop_from_scene, size=len(picture))
+    tone = tones[..., None] * (1 + texture)
+    return picture + covered[..., None] * (tone * np.float32(thing.colour) - picture), covered
 
 
 def _draw_pole(rng: np.random.Generator) -> Occluder:

@@ -23,17 +23,17 @@ from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
 from stream_dmr.training.surroundings import (
     Occluder,
     draw_board,
-    draw_into,
     draw_line,
     draw_occluders,
     draw_ruler,
+    with_thing,
 )
 
 # Share of the scenes with a fish that lies close beside the target, along it: chosen by hand.
 # Without any the network took the ground between two fish as well.
 _BESIDE_SHARE = 0.12
 # Share of the scenes on a measuring board: chosen by hand. Without any, masks ran on to the walls
-# of boxes, and fish between them were not found.
+# of boxes.
 _BOARD_SHARE = 0.16
 
 
@@ -194,7 +194,7 @@ def render_scene(
     """The crop (BGR), and the visible fraction of `targets` in each pixel, 0 to 1."""
     picture = _draw_backdrop(rng, bank, size_px)
     for thing in scene.ground:
-        picture, _ = _with_thing(rng, bank, picture, thing, crop_from_scene)
+        picture, _ = _with_textured_thing(rng, bank, picture, thing, crop_from_scene)
     if rng.random() < _ALIKE_SHARE:
         target = warp_fish(bank, scene.target, crop_from_scene, size=size_px)
         picture = recolour_backdrop(rng, picture, target)
@@ -220,7 +220,7 @@ def render_scene(
         layer = layer if motion is None else cv2.filter2D(layer, -1, motion)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
     for occluder in scene.occluders:
-        picture, covered = _with_thing(rng, bank, picture, occluder, crop_from_scene)
+        picture, covered = _with_textured_thing(rng, bank, picture, occluder, crop_from_scene)
         if occluder.hides:
             mask *= 1 - covered
     inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
@@ -228,21 +228,18 @@ def render_scene(
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
 
 
-def _with_thing(
+def _with_textured_thing(
     rng: np.random.Generator,
     bank: PatchBank,
     picture: Float32[np.ndarray, "S S 3"],
     thing: Occluder,
     crop_from_scene: Float[np.ndarray, "2 3"],
 ) -> tuple[Float32[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
-    """The picture with a thing before it, and the fraction of each pixel that this covers."""
-    size_px = len(picture)
-    covered, tones = draw_into(thing, crop_from_scene, size=size_px)
-    grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
+    """As `with_thing`, with a texture from a background of the bank."""
+    grey = _draw_backdrop(rng, bank, len(picture)).mean(axis=2, keepdims=True)
     texture = grey / max(float(grey.mean()), 1.0) - 1
-    tone = tones[..., None] * (1 + np.float32(rng.uniform(0.0, 0.4)) * texture)
-    colour = thing.colour.astype(np.float32)
-    return picture + covered[..., None] * (tone * colour - picture), covered
+    strength = np.float32(rng.uniform(0.0, 0.4))
+    return with_thing(picture, thing, crop_from_scene, texture=strength * texture)
 
 
 @dataclass(frozen=True)

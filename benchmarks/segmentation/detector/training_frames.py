@@ -6,7 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from benchmarks.segmentation.clone import Clone
 from benchmarks.segmentation.mask_proposer import box_of
@@ -19,7 +19,7 @@ from benchmarks.segmentation.real_images import (
 )
 from stream_dmr.training.annotated_images import read_annotated_images
 from stream_dmr.training.image_degradation import PatchBank, add_weather, simulate_camera
-from stream_dmr.training.surroundings import draw_board, draw_into, draw_occluders
+from stream_dmr.training.surroundings import draw_board, draw_occluders, with_thing
 
 SIDE_PX = 448  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
@@ -168,31 +168,30 @@ def _on_board(
     middle = rng.uniform(0.35, 0.65, 2) * SIDE_PX
     from_scene = np.column_stack([length * np.eye(2), middle])
     for thing in draw_board(rng, -np.radians(angle_deg)):
-        picture = _covered_by(picture, *draw_into(thing, from_scene, size=SIDE_PX), thing.colour)
+        picture, _ = with_thing(picture, thing, from_scene)
     is_fish = np.zeros((SIDE_PX, SIDE_PX), bool)
     if rng.random() < _ON_BOARD_SHARE:
         angle_deg += 180 * rng.integers(2)
         layer = _fish_at(bank.fish[bank.draw_fish(rng)], length, angle_deg, middle)
-        cover = layer[..., 3:] / 255
-        picture = picture * (1 - cover) + layer[..., :3] * rng.uniform(0.7, 1.2)
-        is_fish = cover[..., 0] > 0.5
+        picture, is_fish = _with_layer(rng, picture, layer)
     area = int(is_fish.sum())
     for thing in draw_occluders(rng) if rng.random() < 0.5 else []:
-        hidden, tones = draw_into(thing, from_scene, size=SIDE_PX)
-        picture = _covered_by(picture, hidden, tones, thing.colour)
+        picture, hidden = with_thing(picture, thing, from_scene)
         is_fish &= hidden < 0.5
     is_shown = is_fish.any() and is_fish.sum() > _MIN_VISIBLE * area
     boxes = np.array([box_of(is_fish)], np.float64) if is_shown else np.zeros((0, 4))
     return picture.clip(0, 255).astype(np.float32), boxes
 
 
-def _covered_by(
+def _with_layer(
+    rng: np.random.Generator,
     picture: Float32[np.ndarray, "S S 3"],
-    covered: Float32[np.ndarray, "S S"],
-    tones: Float32[np.ndarray, "S S"],
-    colour: Float[np.ndarray, "3"],
-) -> Float32[np.ndarray, "S S 3"]:
-    return picture + covered[..., None] * (tones[..., None] * np.float32(colour) - picture)
+    layer: Float32[np.ndarray, "S S 4"],
+) -> tuple[Float32[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
+    """The picture with a fish before it, a little darker or lighter, and where the fish is."""
+    cover = layer[..., 3:] / 255
+    is_here = cover[..., 0] > 0.5
+    return picture * (1 - cover) + layer[..., :3] * rng.uniform(0.7, 1.2), is_here
 
 
 def _mosaic(
@@ -224,9 +223,7 @@ def _with_fish(
     for index in range(count):
         size = float(np.clip(usual * np.exp(rng.normal(0.0, 0.35)), *_SIZES_PX))
         layer = _placed_fish(rng, bank, size)
-        cover = layer[..., 3:] / 255
-        picture = picture * (1 - cover) + layer[..., :3] * rng.uniform(0.7, 1.2)
-        is_here = cover[..., 0] > 0.5
+        picture, is_here = _with_layer(rng, picture, layer)
         owner[is_here] = index
         areas.append(int(is_here.sum()))
     added = [
