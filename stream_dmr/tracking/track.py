@@ -1,6 +1,6 @@
 """One followed fish: its predicted position, size, appearance, and certainty of identity."""
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +61,8 @@ class Track:
         self.area, self.colours = observation.area, observation.colours
         self.length = observation.length
         self.was_separate = not observation.is_piece  # always a piece: it may be no fish
+        self.began_as_piece = observation.is_piece
+        self.frames_beside = Counter[int]()  # by the number of a track that was seen in them, too
         self._evidence = FishEvidence(observation.candidate, self.size)
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain

@@ -30,6 +30,7 @@ _MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
 _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
 _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
+_MIN_FRAMES_BESIDE = 3  # in which a newcomer and a fish were seen at once: they are two
 
 
 class TrackerSettings(Settings):
@@ -92,21 +93,29 @@ class Tracker:
         self._keep_covered(observations)
         self._drop_lost(frame)
         self._start_tracks(self._reidentify(unassigned), frame.frame_index)
+        seen = [track.number for track in self._tracks if track.lost_frames == 0]
+        for track in self._tracks:
+            if track.began_as_piece and track.lost_frames == 0:
+                track.frames_beside.update(seen)
         return [
             t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
         ]
 
-    def _fish_inside(self, observation: Observation) -> list[Track]:
-        """The tracks whose predicted box lies mostly inside an observation's."""
+    def _fish_inside(self, observation: Observation, *, newcomers: bool = False) -> list[Track]:
+        """The tracks whose predicted box lies mostly inside an observation's.
+
+        `newcomers`: those as well that were seen in a frame or two, as pieces of blobs.
+        """
         return [
             track
             for track in self._tracks
-            if track.may_be_hidden and track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
+            if (track.may_be_hidden or (newcomers and track.began_as_piece))
+            and track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
         ]
 
     def _split(self, frame: Frame, observation: Observation) -> list[Observation]:
         """The pieces of a blob that several fish share; `[observation]` for any other."""
-        fish = self._fish_inside(observation)
+        fish = self._fish_inside(observation, newcomers=True)
         largest = max((track.area for track in fish), default=np.inf)
         is_merged = observation.area >= _MIN_MERGED_AREA_RATIO * largest
         if not is_merged or any(track.observation.touches_border for track in fish):
@@ -187,7 +196,8 @@ class Tracker:
     def _reidentify(self, unassigned: Sequence[Observation]) -> list[Observation]:
         """Settle the identities of fish that were merged or lost; return what is still unassigned.
 
-        Tracks too young to be known count as new observations: they may be an older fish.
+        Tracks too young to be known count as new observations: they may be an older fish, unless
+        they came into its blob while it was seen there.
         """
         may_be_behind = self._settings.max_hidden_frames > 0
         for track in self._tracks:
@@ -195,8 +205,13 @@ class Tracker:
             if is_unclear and track.frames_seen >= _MIN_KNOWN_FRAMES:
                 track.make_uncertain()
         uncertain = [t for t in (*self._tracks, *self._hidden) if t.snapshot is not None]
+        lost = [track.number for track in uncertain if track.lost_frames > 0]
         young = [
-            t for t in self._tracks if t.frames_seen < _MIN_KNOWN_FRAMES and t.lost_frames == 0
+            t
+            for t in self._tracks
+            if t.frames_seen < _MIN_KNOWN_FRAMES
+            and t.lost_frames == 0
+            and all(t.frames_beside[number] < _MIN_FRAMES_BESIDE for number in lost)
         ]
         new = [*unassigned, *(track.observation for track in young)]
         new = [seen for seen in new if not seen.is_piece and not seen.touches_border]

@@ -238,6 +238,20 @@ def test_two_fish_that_cross_keep_their_ids(a: float, b: float, length: int, ali
         assert where == pytest.approx({1: owner[0], 2: owner[1]})
 
 
+@pytest.mark.parametrize("newcomer", [(200, 126), (195, 124)])
+def test_a_fish_that_came_into_the_blob_of_another_is_not_that_one_when_left_alone(
+    newcomer: tuple[int, int],
+):
+    first = (150, 100)
+    alone = [blobs_of(first)] * 12
+    together = [blobs_of(first, newcomer)] * 3
+    assert len(together[0]) == 1
+    found = track([*alone, *together, *[blobs_of(newcomer)] * 9])
+    assert [one.track_number for one in found[11]] == [1]
+    assert all(1 not in [one.track_number for one in frame] for frame in found[-9:])
+    assert len({one.track_number for frame in found[-9:] for one in frame}) == 1
+
+
 def test_two_fish_in_one_candidate_are_not_reported():
     apart = [[(200 + 8 * i, 200, 80, 40, 200), (440 - 8 * i, 200, 80, 40, 200)] for i in range(10)]
     together = [[(320, 200, 150, 44, 200)]] * 3
