@@ -156,6 +156,8 @@ _TRIMMING_CORRECTION = 1.1  # full over trimmed second moments of a normal distr
 _NUM_TRIMMINGS = 4  # of the first picture's covariance; converged by then
 _INITIAL_WINDOW = 1 / 6  # of the longer side: a median over so much shows no fish
 _COVARIANCE_FRAMES = 10  # over which a region's covariance is learnt
+_AROUND, _WIDE_SHARE = 3, np.float32(0.05)  # regions around a fish, and what they weigh
+_UNCOVERED_RATIO = 0.5  # of colours off their surroundings, the picture's to the model's
 # Largest factor by which a place that always changes, such as a shaking edge, raises its variance.
 _MAX_VARIANCE_RATIO = np.float32(8)
 # Constants of compiled code; other types would make its sums float64.
@@ -172,7 +174,7 @@ class BackgroundModel:
 
     def __init__(self, picture: UInt8[np.ndarray, "3 H W"], *, memory_frames: float) -> None:
         height, width = picture.shape[1:]
-        self._memory_frames = memory_frames
+        self._memory_frames, self._frames_learnt = memory_frames, 0
         self._size = (width, height)
         self._region_px = max(3, round(_REGION * max(width, height) / _STRIDE)) | 1  # strides
         window_px = max(3, round(_INITIAL_WINDOW * max(width, height) / 4)) | 1
@@ -203,6 +205,35 @@ class BackgroundModel:
             np.copyto(self.mean, picture, where=is_unseen)
             self._age[is_unseen] = 0
 
+    @property
+    def is_young(self) -> bool:
+        """True while the first picture, which may show fish, is remembered."""
+        return self._frames_learnt < self._memory_frames
+
+    def uncover(
+        self, picture: UInt8[np.ndarray, "3 H W"], foreign: UInt8[np.ndarray, "H W"]
+    ) -> Bool[np.ndarray, "H W"]:
+        """Where a fish of the first picture has gone, which is learnt: background, not foreign.
+
+        There the picture is like what is around the foreign pixels, and the model is not.
+        """
+        weight = cv2.merge([(foreign[_GRID] == 0).astype(np.float32)] * 3)
+        seen = weight * cv2.merge(list(picture[:, *_GRID].astype(np.float32)))
+        wide = (_AROUND * self._region_px,) * 2  # counts where all of a region is foreign
+        total, share = (
+            self._box_mean(layers) + _WIDE_SHARE * cv2.blur(layers, wide)
+            for layers in (seen, weight)
+        )
+        near = cv2.resize(total / np.maximum(share, np.float32(1e-3)), self._size)
+        off, model_off = (
+            cv2.blur(np.abs(cv2.merge(list(layers)).astype(np.float32) - near).sum(axis=2), (5, 5))
+            for layers in (picture, self.mean)
+        )
+        uncovered = (foreign > 0) & (off < _UNCOVERED_RATIO * model_off)
+        np.copyto(self.mean, picture, where=uncovered)
+        self._age[uncovered] = 0
+        return uncovered
+
     def distance(self, picture: UInt8[np.ndarray, "3 H W"]) -> Float32[np.ndarray, "H W"]:
         """Squared Mahalanobis distance of each pixel from the background; about 3 on average."""
         return _distance(picture, self.mean, self._regions, self._variance_ratio)
@@ -214,6 +245,7 @@ class BackgroundModel:
         rate: Float32[np.ndarray, "H W"],
     ) -> None:
         """Update the model by a picture and its `distance`; `rate` from 0 (not) to 1 (full)."""
+        self._frames_learnt += 1
         inlier_rate = rate[_GRID] * (distance[_GRID] < _MAX_INLIER_DISTANCE)
         light, moments = self._region_statistics(picture, inlier_rate)
         self._moments += (_TRIMMING_CORRECTION * moments - self._moments) / _COVARIANCE_FRAMES

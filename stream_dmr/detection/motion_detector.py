@@ -211,6 +211,8 @@ class MotionDetector:
         background.fill_unseen(picture)
         distance = background.distance(picture)
         foreign = _find_foreign(distance, self._settings.motion_min_distance)
+        if background.is_young:
+            foreign[background.uncover(picture, foreign)] = 0
         still = _find_still(foreign, aligned, self._before)
         rate = cv2.LUT(cv2.dilate(foreign, _disc(5)), _RATES)
         rate[still] = _STILL_RATE

@@ -120,6 +120,35 @@ def test_a_fish_in_the_first_picture_is_not_taken_for_background():
     assert np.median(model.mean[:, 80:86, 100:112]) < 140
 
 
+@settings(max_examples=10)
+@given(seeds)
+def test_where_a_fish_of_the_first_picture_has_gone_is_uncovered_and_where_one_is_now_is_not(
+    seed: int,
+):
+    before, now = np.s_[20:40, 30:60], np.s_[36:56, 50:80]
+    model = learnt([noise(seed)])
+    model.mean[:, *before] = 60.0
+    picture = noise(seed + 1)
+    picture[:, *now] = 70
+    foreign = np.zeros((HEIGHT, WIDTH), np.uint8)
+    foreign[before], foreign[now] = 1, 1
+
+    uncovered = model.uncover(picture, foreign)
+    left = foreign.copy()
+    left[now] = 0
+    assert not uncovered[38:54, 52:78].any()  # but for a rim, since noise is averaged
+    assert np.count_nonzero(uncovered) > 0.9 * np.count_nonzero(left)
+    assert not uncovered[foreign == 0].any()
+    np.testing.assert_array_equal(model.mean[:, uncovered], picture[:, uncovered])
+
+
+def test_the_first_picture_is_remembered_for_as_long_as_the_memory_is():
+    model = learnt([noise(i) for i in range(6)], memory_frames=6.0)
+    assert model.is_young
+    model.learn(noise(6), model.distance(noise(6)), EVERYWHERE)
+    assert not model.is_young
+
+
 def test_a_change_of_light_is_not_foreign():
     model = learnt([noise(i) for i in range(5)])
     lit = noise(7, level=135)
