@@ -95,7 +95,8 @@ class Tracker:
         self._start_tracks(self._reidentify(unassigned), frame.frame_index)
         seen = [track.number for track in self._tracks if track.lost_frames == 0]
         for track in self._tracks:
-            if track.began_as_piece and track.lost_frames == 0:
+            is_newcomer = track.began_as_piece and track.frames_seen < _MIN_KNOWN_FRAMES
+            if is_newcomer and track.lost_frames == 0:
                 track.frames_beside.update(seen)
         return [
             t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
