@@ -102,21 +102,24 @@ class Tracker:
             t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
         ]
 
-    def _fish_inside(self, observation: Observation, *, newcomers: bool = False) -> list[Track]:
-        """The tracks whose predicted box lies mostly inside an observation's.
-
-        `newcomers`: those as well that were seen in a frame or two, as pieces of blobs.
-        """
+    def _inside(self, observation: Observation) -> list[Track]:
+        """The tracks whose predicted box lies mostly inside an observation's."""
         return [
             track
             for track in self._tracks
-            if (track.may_be_hidden or (newcomers and track.began_as_piece))
-            and track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
+            if track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
         ]
+
+    def _fish_inside(self, observation: Observation) -> list[Track]:
+        return [track for track in self._inside(observation) if track.may_be_hidden]
 
     def _split(self, frame: Frame, observation: Observation) -> list[Observation]:
         """The pieces of a blob that several fish share; `[observation]` for any other."""
-        fish = self._fish_inside(observation, newcomers=True)
+        inside = self._inside(observation)
+        fish = [track for track in inside if track.may_be_hidden]
+        new = [track for track in inside if track.began_as_piece and not track.may_be_hidden]
+        if len(fish) == len(new) == 1:  # of more, each would make new ones of its parts
+            fish += new
         largest = max((track.area for track in fish), default=np.inf)
         is_merged = observation.area >= _MIN_MERGED_AREA_RATIO * largest
         if not is_merged or any(track.observation.touches_border for track in fish):
