@@ -25,7 +25,11 @@ def blobs_of(*fish: tuple[int, int], score: float = 1.0) -> list[Candidate]:
     union = np.zeros(SIZE[::-1], np.uint8)
     for center in fish:
         union |= ellipse_mask(size=SIZE, center=center, axes=(60, 18), angle=0.0)
-    count, labels, _, _ = cv2.connectedComponentsWithStats(union)
+    return candidates_of(union, score=score)
+
+
+def candidates_of(moving: np.ndarray, *, score: float = 1.0) -> list[Candidate]:
+    count, labels, _, _ = cv2.connectedComponentsWithStats(moving)
     candidates = []
     for label in range(1, count):
         x, y, w, h = cv2.boundingRect((labels == label).astype(np.uint8))
@@ -250,6 +254,20 @@ def test_a_fish_that_came_into_the_blob_of_another_is_not_that_one_when_left_alo
     assert [one.track_number for one in found[11]] == [1]
     assert all(1 not in [one.track_number for one in frame] for frame in found[-9:])
     assert len({one.track_number for frame in found[-9:] for one in frame}) == 1
+
+
+def test_of_a_shoal_whose_blobs_part_and_merge_not_ever_more_tracks_are_open():
+    rng = np.random.default_rng(4)
+    tracker = Tracker(TrackerSettings())
+    image = np.full((*SIZE[::-1], 3), 90, np.uint8)
+    inside = np.pad(np.ones((SIZE[1] - 20, SIZE[0] - 20), bool), 10)
+    noise = np.zeros(SIZE[::-1])
+    for index in range(1, 56):
+        noise = 0.8 * noise + 0.6 * rng.normal(size=noise.shape)
+        smooth = cv2.GaussianBlur(noise, (0, 0), 12)
+        moving = inside & (smooth > -0.2 * smooth.std())
+        tracker.step(frame_of(image, index), candidates_of(moving.astype(np.uint8)))
+        assert len(tracker.open_numbers) < 60
 
 
 def test_two_fish_in_one_candidate_are_not_reported():
