@@ -29,6 +29,9 @@ _POLE_WIDTH = 1 / 50  # of the longer side; a blob that is thinner throughout ma
 _MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
 _MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller parts are fins and hooks
 _MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
+# Likewise, beyond these, of what ends there, no line, which goes on; and by how much it may make
+# the thick part broader, or it is a gaff.
+_MAX_FREE_END, _MAX_BROADER = 0.8, 1.3
 _MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thicker
 _MIN_THICKNESS_PX = 3.5
 
@@ -53,6 +56,8 @@ def fish_blobs(
     fish, refused = [], Counter[Refusal]()
     count, labels, stats = components(moving.view(np.uint8))
     height, width = moving.shape
+    inner = np.zeros((height - 4, width - 4), bool)
+    is_at_edge = np.pad(inner, 2, constant_values=True)
     for label in range(1, count):
         x, y, w, h, area = stats[label].tolist()
         touches_edge = min(x, y, width - x - w, height - y - h) <= 1
@@ -61,7 +66,7 @@ def fish_blobs(
             refused[Refusal.THIN if touches_edge else Refusal.SHORT] += 1
             continue
         part = np.s_[y : y + h, x : x + w]
-        blobs = _without_poles(labels[part] == label, pole_px, touches_edge=touches_edge)
+        blobs = _without_poles(labels[part] == label, pole_px, is_at_edge[part])
         refused[Refusal.THIN] += not blobs
         for blob in blobs:
             refusal = _refusal(blob, min_length_px, max_length_px)
@@ -75,7 +80,7 @@ def fish_blobs(
 
 
 def _without_poles(
-    blob: Bool[np.ndarray, "h w"], pole_px: int, *, touches_edge: bool
+    blob: Bool[np.ndarray, "h w"], pole_px: int, is_at_edge: Bool[np.ndarray, "h w"]
 ) -> list[Bool[np.ndarray, "h w"]]:
     """The thick parts of a blob, each with a fish's thin ends; none for a mere pole or line.
 
@@ -85,11 +90,12 @@ def _without_poles(
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
     bodies = _bodies(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel), _MIN_BODY_AREA * pole_px**2)
     if not bodies:
-        return [] if touches_edge else [blob]
+        return [] if (blob & is_at_edge).any() else [blob]
     body_px = [max(cv2.boundingRect(body)[2:]) for body in bodies]
     if len(bodies) == 1 and max(blob.shape) <= body_px[0] + round(_MAX_END_LENGTH * body_px[0]):
         return [blob]
-    fish = _with_ends(bodies, [round(_MAX_END_LENGTH * px) for px in body_px], region)
+    ends_px = [round(_MAX_END_LENGTH * px) for px in body_px]
+    fish = _with_ends(bodies, ends_px, region, np.pad(is_at_edge, pole_px))
     return [blob[pole_px:-pole_px, pole_px:-pole_px] > 0 for blob in fish]
 
 
@@ -102,9 +108,16 @@ def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[
 
 
 def _with_ends(
-    bodies: list[UInt8[np.ndarray, "h w"]], ends_px: list[int], region: UInt8[np.ndarray, "h w"]
+    bodies: list[UInt8[np.ndarray, "h w"]],
+    ends_px: list[int],
+    region: UInt8[np.ndarray, "h w"],
+    is_at_edge: Bool[np.ndarray, "h w"],
 ) -> list[UInt8[np.ndarray, "h w"]]:
-    """Bodies grown within a region, back to the ends and no further, each before the others."""
+    """Bodies grown within a region, back to the ends and no further, each before the others.
+
+    A slender fish has longer ends than that: what is left of the region, short, touched by one body
+    only and within the picture.
+    """
     free = region.copy()
     for body in bodies:
         free[body > 0] = 0
@@ -115,7 +128,23 @@ def _with_ends(
                 new = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), free)
                 body[new > 0] = 1
                 free[new > 0] = 0
+    count, labels, stats = components(free)
+    for label in range(1, count):
+        rest = labels == label
+        near = cv2.dilate(rest.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        touched = [i for i, body in enumerate(grown) if (body[near] > 0).any()]
+        length_px = max(stats[label, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]])
+        if len(touched) == 1 and not is_at_edge[rest].any():
+            (i,) = touched
+            whole = np.where(rest, np.uint8(1), grown[i])
+            is_along = _breadth(whole) <= _MAX_BROADER * _breadth(bodies[i])
+            if is_along and length_px <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]:
+                grown[i] = whole
     return grown
+
+
+def _breadth(shape: UInt8[np.ndarray, "h w"]) -> float:
+    return min(cv2.minAreaRect(cv2.findNonZero(shape))[1]) + 1
 
 
 def _refusal(

@@ -58,6 +58,32 @@ def test_a_tail_behind_a_thin_stalk_is_part_of_its_fish():
     assert cv2.boundingRect(fish.view(np.uint8))[2] > 115
 
 
+def hang(picture: np.ndarray) -> None:
+    """A slender fish on a line: its thick part ends at row 200, its tail at row 240."""
+    cv2.line(picture, (200, 0), (200, 150), 1, 2)
+    cv2.ellipse(picture, (200, 170), (30, 9), 90, 0, 360, 1, -1)
+    cv2.line(picture, (200, 195), (200, 236), 1, 4)
+    cv2.ellipse(picture, (200, 236), (4, 6), 0, 0, 360, 1, -1)
+
+
+def test_a_slender_fish_on_a_line_keeps_its_tail():
+    [fish] = drawn(hang)
+    _, y, _, h = cv2.boundingRect(fish.view(np.uint8))
+    assert y > 125  # without the line
+    assert y + h > 240
+
+
+def test_the_end_of_a_gaff_before_a_fish_is_none_of_it():
+    def draw(picture: np.ndarray) -> None:
+        hang(picture)
+        cv2.line(picture, (479, 60), (160, 185), 1, 5)
+
+    [fish] = drawn(draw)
+    x, _, w, _ = cv2.boundingRect(fish.view(np.uint8))
+    assert x > 175
+    assert x + w < 225
+
+
 def test_a_bent_fish_seen_edge_on_is_kept_whole():
     for width in (6, 8, 10, 12):
         [fish] = drawn(lambda p, w=width: cv2.ellipse(p, (200, 200), (60, 40), 0, 0, 110, 1, w))
