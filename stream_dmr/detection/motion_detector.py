@@ -29,8 +29,8 @@ _POLE_WIDTH = 1 / 50  # of the longer side; a blob that is thinner throughout ma
 _MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
 _MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller parts are fins and hooks
 _MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
-# Likewise, beyond these, of what ends there, no line, which goes on; and by how much it may make
-# the thick part broader, or it is a gaff.
+# A slender fish has longer ends: a thin rest is one if it is no longer than this, likewise, since
+# lines go on, and makes the thick part no broader than this many times, as a gaff's tip does.
 _MAX_FREE_END, _MAX_BROADER = 0.8, 1.3
 _MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thicker
 _MIN_THICKNESS_PX = 3.5
@@ -56,8 +56,8 @@ def fish_blobs(
     fish, refused = [], Counter[Refusal]()
     count, labels, stats = components(moving.view(np.uint8))
     height, width = moving.shape
-    inner = np.zeros((height - 4, width - 4), bool)
-    is_at_edge = np.pad(inner, 2, constant_values=True)
+    is_at_edge = np.ones(moving.shape, bool)
+    is_at_edge[2:-2, 2:-2] = False
     for label in range(1, count):
         x, y, w, h, area = stats[label].tolist()
         touches_edge = min(x, y, width - x - w, height - y - h) <= 1
@@ -95,7 +95,8 @@ def _without_poles(
     if len(bodies) == 1 and max(blob.shape) <= body_px[0] + round(_MAX_END_LENGTH * body_px[0]):
         return [blob]
     ends_px = [round(_MAX_END_LENGTH * px) for px in body_px]
-    fish = _with_ends(bodies, ends_px, region, np.pad(is_at_edge, pole_px))
+    fish, rest = _with_ends(bodies, ends_px, region)
+    _add_free_ends(fish, rest, bodies, ends_px, is_at_edge=np.pad(is_at_edge, pole_px))
     return [blob[pole_px:-pole_px, pole_px:-pole_px] > 0 for blob in fish]
 
 
@@ -108,15 +109,11 @@ def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[
 
 
 def _with_ends(
-    bodies: list[UInt8[np.ndarray, "h w"]],
-    ends_px: list[int],
-    region: UInt8[np.ndarray, "h w"],
-    is_at_edge: Bool[np.ndarray, "h w"],
-) -> list[UInt8[np.ndarray, "h w"]]:
+    bodies: list[UInt8[np.ndarray, "h w"]], ends_px: list[int], region: UInt8[np.ndarray, "h w"]
+) -> tuple[list[UInt8[np.ndarray, "h w"]], UInt8[np.ndarray, "h w"]]:
     """Bodies grown within a region, back to the ends and no further, each before the others.
 
-    A slender fish has longer ends than that: what is left of the region, short, touched by one body
-    only and within the picture.
+    Also returns what is left of the region.
     """
     free = region.copy()
     for body in bodies:
@@ -128,37 +125,51 @@ def _with_ends(
                 new = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), free)
                 body[new > 0] = 1
                 free[new > 0] = 0
-    count, labels, stats = components(free)
+    return grown, free
+
+
+def _add_free_ends(
+    fish: list[UInt8[np.ndarray, "h w"]],
+    rest: UInt8[np.ndarray, "h w"],
+    bodies: list[UInt8[np.ndarray, "h w"]],
+    ends_px: list[int],
+    *,
+    is_at_edge: Bool[np.ndarray, "h w"],
+) -> None:
+    """Add to each fish the short parts of the rest along it that end within the picture."""
+    count, labels, stats = components(rest)
     for label in range(1, count):
-        rest = labels == label
-        near = cv2.dilate(rest.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        touched = [i for i, body in enumerate(grown) if (body[near] > 0).any()]
-        length_px = max(stats[label, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]])
-        if len(touched) == 1 and not is_at_edge[rest].any():
-            (i,) = touched
-            whole = np.where(rest, np.uint8(1), grown[i])
-            is_along = _breadth(whole) <= _MAX_BROADER * _breadth(bodies[i])
-            if is_along and length_px <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]:
-                grown[i] = whole
-    return grown
+        part = labels == label
+        if is_at_edge[part].any():
+            continue
+        near = cv2.dilate(part.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        touched = [i for i, one in enumerate(fish) if one[near].any()]
+        if len(touched) != 1:
+            continue
+        (i,) = touched
+        whole = np.where(part, np.uint8(1), fish[i])
+        is_short = max(stats[label, 2:4]) <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]
+        if is_short and _sides_px(whole)[0] <= _MAX_BROADER * _sides_px(bodies[i])[0]:
+            fish[i] = whole
 
 
-def _breadth(shape: UInt8[np.ndarray, "h w"]) -> float:
-    return min(cv2.minAreaRect(cv2.findNonZero(shape))[1]) + 1
+def _sides_px(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Breadth and length of the smallest rectangle around a blob."""
+    breadth, length = sorted(cv2.minAreaRect(cv2.findNonZero(blob.view(np.uint8)))[1])
+    return breadth + 1, length + 1
 
 
 def _refusal(
     blob: Bool[np.ndarray, "h w"], min_length_px: float, max_length_px: float
 ) -> Refusal | None:
     """None if length and mean thickness (area over length) are those of a fish."""
-    points = cv2.findNonZero(blob.view(np.uint8))
-    length_px = max(cv2.minAreaRect(points)[1]) + 1
+    _, length_px = _sides_px(blob)
     if length_px < min_length_px:
         return Refusal.SHORT
     if length_px > max_length_px:
         return Refusal.LONG
     min_thickness_px = max(_MIN_THICKNESS * length_px, _MIN_THICKNESS_PX)
-    return None if len(points) / length_px >= min_thickness_px else Refusal.THIN
+    return None if np.count_nonzero(blob) / length_px >= min_thickness_px else Refusal.THIN
 
 
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
