@@ -26,7 +26,8 @@ from stream_dmr.settings import Settings
 
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
 _POLE_WIDTH = 1 / 50  # of the longer side; a blob that is thinner throughout may be a gaff or line
-_MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
+_THIN_WIDTHS = 0.45, 0.65  # of a pole's: lines are thinner, slender fish on them thicker
+_MIN_BODY_AREA = 3.0  # widths squared; a smaller thick part is a bend of a thin object
 _MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller parts are fins and hooks
 _MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
 # A slender fish has longer ends: a thin rest is one if it is no longer than this, likewise, since
@@ -49,8 +50,9 @@ def fish_blobs(
 ) -> tuple[list[Bool[np.ndarray, "H W"]], Counter[Refusal]]:
     """The connected components that may be fish, without connected poles and lines.
 
-    A thin component that reaches the edge of the picture is a pole or a line; a thin component
-    inside may be a fish seen edge-on. Also returns how many components were refused, by reason.
+    A thin component that reaches the edge of the picture is a pole or a line, but for a thicker
+    stretch inside, which is a slender fish on its line; a thin component inside may be a fish seen
+    edge-on. Also returns how many components were refused, by reason.
     """
     pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
     fish, refused = [], Counter[Refusal]()
@@ -87,8 +89,14 @@ def _without_poles(
     Two thick parts that only a thin bridge joins are two fish that touch each other.
     """
     region = np.pad(blob, pole_px).astype(np.uint8)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
-    bodies = _bodies(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel), _MIN_BODY_AREA * pole_px**2)
+    at_edge = np.pad(is_at_edge, pole_px)
+    bodies = _bodies(region, pole_px)
+    for thin in _THIN_WIDTHS:
+        if not bodies:
+            bodies = _bodies(region, round(thin * pole_px) | 1)
+            if any(at_edge[body > 0].any() for body in bodies):
+                return []
+            bodies = [body for body in bodies if _is_thick(body)]
     if not bodies:
         return [] if (blob & is_at_edge).any() else [blob]
     body_px = [max(cv2.boundingRect(body)[2:]) for body in bodies]
@@ -96,15 +104,17 @@ def _without_poles(
         return [blob]
     ends_px = [round(_MAX_END_LENGTH * px) for px in body_px]
     fish, rest = _with_ends(bodies, ends_px, region)
-    _add_free_ends(fish, rest, bodies, ends_px, is_at_edge=np.pad(is_at_edge, pole_px))
+    _add_free_ends(fish, rest, bodies, ends_px, is_at_edge=at_edge)
     return [blob[pole_px:-pole_px, pole_px:-pole_px] > 0 for blob in fish]
 
 
-def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[np.ndarray, "h w"]]:
-    """The largest component, and components nearly as large; a tail fin is smaller."""
+def _bodies(region: UInt8[np.ndarray, "h w"], width_px: int) -> list[UInt8[np.ndarray, "h w"]]:
+    """The largest part that is so wide, and parts nearly as large; a tail fin is smaller."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width_px, width_px))
+    opened = cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel)
     count, labels, stats = components(opened)
     areas = stats[1:, cv2.CC_STAT_AREA]
-    least = max(min_area_px, _MIN_BODY_RATIO * max(areas, default=0))
+    least = max(_MIN_BODY_AREA * width_px**2, _MIN_BODY_RATIO * max(areas, default=0))
     return [(labels == i).astype(np.uint8) for i in range(1, count) if areas[i - 1] >= least]
 
 
@@ -149,7 +159,8 @@ def _add_free_ends(
         (i,) = touched
         whole = np.where(part, np.uint8(1), fish[i])
         is_short = max(stats[label, 2:4]) <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]
-        if is_short and _sides_px(whole)[0] <= _MAX_BROADER * _sides_px(bodies[i])[0]:
+        is_along = _sides_px(whole)[0] <= _MAX_BROADER * _sides_px(bodies[i])[0]
+        if is_short and is_along and _is_thick(whole):
             fish[i] = whole
 
 
@@ -168,8 +179,13 @@ def _refusal(
         return Refusal.SHORT
     if length_px > max_length_px:
         return Refusal.LONG
-    min_thickness_px = max(_MIN_THICKNESS * length_px, _MIN_THICKNESS_PX)
-    return None if np.count_nonzero(blob) / length_px >= min_thickness_px else Refusal.THIN
+    return None if _is_thick(blob) else Refusal.THIN
+
+
+def _is_thick(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> bool:
+    _, length_px = _sides_px(blob)
+    thickness_px = np.count_nonzero(blob) / length_px
+    return bool(thickness_px >= max(_MIN_THICKNESS * length_px, _MIN_THICKNESS_PX))
 
 
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+import pytest
 
 from stream_dmr.detection.motion_detector import Refusal, fish_blobs
 
@@ -71,6 +72,18 @@ def test_a_slender_fish_on_a_line_keeps_its_tail():
     _, y, _, h = cv2.boundingRect(fish.view(np.uint8))
     assert y > 125  # without the line
     assert y + h > 240
+
+
+@pytest.mark.parametrize("top", [0, 20])
+def test_a_fish_as_slender_as_a_pole_is_parted_from_its_line(top: int):
+    def draw(picture: np.ndarray) -> None:
+        cv2.line(picture, (200, top), (200, 160), 1, 2)
+        cv2.ellipse(picture, (200, 200), (42, 4), 90, 0, 360, 1, -1)
+
+    [fish] = drawn(draw)
+    _, y, _, h = cv2.boundingRect(fish.view(np.uint8))
+    assert y > 125
+    assert y + h > 235
 
 
 def test_the_end_of_a_gaff_before_a_fish_is_none_of_it():
