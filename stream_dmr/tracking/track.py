@@ -30,6 +30,7 @@ _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 # once and its speed is unknown.
 _MAX_DEVIATIONS = 3.0
 _MIN_GATE, _MAX_GATE, _FIRST_GATE = 0.3, 0.7, 1.2
+_SPEED_CHANGE = 0.2  # of the way that a lost fish is predicted to have gone
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
 _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
 _LEARNING_RATE = 0.35  # of the area, per frame
@@ -177,9 +178,16 @@ class Track:
         self._filter.x, self._filter.P = snapshot.state.copy(), snapshot.covariance.copy()
         self.update(observation)
 
-    def cost(self, observation: Observation) -> float:
-        """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
-        if self._distance(observation) > self._gate:
+    def cost(self, observation: Observation, *, is_only_one: bool = False) -> float:
+        """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates.
+
+        `is_only_one`: no other fish may be it, so it may have been faster or slower while lost.
+        """
+        gate = self._gate
+        if is_only_one:
+            way = self.lost_frames * float(np.hypot(*self._filter.x[2:, 0])) / max(self.size, 1.0)
+            gate = min(gate + _SPEED_CHANGE * way, _FIRST_GATE)
+        if self._distance(observation) > gate:
             return IMPOSSIBLE
         offset = observation.center - self.center
         S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R

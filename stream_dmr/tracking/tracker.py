@@ -155,7 +155,22 @@ class Tracker:
             if costs[row, column] < IMPOSSIBLE:
                 self._tracks[row].update(observations[column])
                 assigned.add(column)
-        return [seen for i, seen in enumerate(observations) if i not in assigned]
+        left = [seen for i, seen in enumerate(observations) if i not in assigned]
+        return [seen for seen in left if not self._resume_lost(seen, left)]
+
+    def _resume_lost(self, seen: Observation, others: Sequence[Observation]) -> bool:
+        """Go on with the only lost fish that an observation may show, if it is the only such one.
+
+        A gaff hides a fish for some frames, in which it may be hauled faster or slower.
+        """
+        lost = [track for track in self._tracks if track.lost_frames > 1 and track.snapshot is None]
+        alike = [track for track in lost if track.cost(seen, is_only_one=True) < IMPOSSIBLE]
+        if seen.is_piece or len(alike) != 1:
+            return False
+        if sum(alike[0].cost(other, is_only_one=True) < IMPOSSIBLE for other in others) > 1:
+            return False
+        alike[0].update(seen)
+        return True
 
     def _keep_covered(self, observations: Sequence[Observation]) -> None:
         """Keep lost fish that are predicted behind another fish that has just been seen."""

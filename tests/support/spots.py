@@ -29,6 +29,6 @@ def spots_candidates(spots: Iterable[Spot]) -> list[Candidate]:
     return [Candidate(bbox_xyxy_px=box, score=1.0) for box in boxes]
 
 
-def climbing(i: int, *, x: float = 300.0, speed: float = 12.0) -> Spot:
+def climbing(i: float, *, x: float = 300.0, speed: float = 12.0) -> Spot:
     """A fish that is hauled up, in its i-th frame."""
     return (x, 420 - speed * i, 40, 100, 200)

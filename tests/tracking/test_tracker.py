@@ -204,6 +204,22 @@ def test_a_fish_that_is_hauled_by_its_own_length_a_frame_is_one_from_the_first()
     assert [[one.track_number for one in found] for found in track(frames)] == [[1]] * 3
 
 
+def hauled_behind_a_gaff(*lanes: float, later: float) -> list[list[int]]:
+    """Ids of a fish, this many px late, after six frames in which it and others were hidden."""
+    frames = [[climbing(i, x=x) for x in lanes] for i in range(8)] + [[]] * 6
+    frames += [[climbing(i - later / 12, x=np.mean(lanes).item())] for i in range(14, 20)]
+    return ids(follow(frames))[14:]
+
+
+def test_a_fish_may_be_hauled_slower_behind_a_gaff():
+    assert hauled_behind_a_gaff(300.0, later=40.0) == [[1]] * 6
+    assert hauled_behind_a_gaff(300.0, later=95.0) == [[2]] * 6
+
+
+def test_a_fish_that_comes_from_behind_a_gaff_may_be_either_of_two():
+    assert hauled_behind_a_gaff(300.0, 342.0, later=36.0) == [[3]] * 6
+
+
 def test_dropped_frames_are_a_gap_like_any_other():
     frames = [[climbing(i)] for i in range(30)]
     kept = [i for i in range(1, 31) if i not in (9, 10, 11, 20)]
