@@ -356,7 +356,7 @@ _STILLS: dict[str, dict[str, Any]] = {
     # Nobody waits for the next frame.
     "crop_fish": {"segmenter_sizes_px": [128, 192, 256], "second_look": True},
     "detect_fish": {"detector": "looks"},  # nothing moves
-    "track_fish": {"min_track_frames": 1, "across_frames": False, "min_score": 0.52},
+    "track_fish": {"min_track_frames": 1, "across_frames": False, "min_score": 0.54},
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
 }
 

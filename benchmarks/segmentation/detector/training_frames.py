@@ -1,5 +1,6 @@
 """Frames with boxes around their fish: photographs, and fish put before backgrounds."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,13 @@ SIDE_PX = 448  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
 _FRAME_SHARE, _SINGLE_SHARE = 0.45, 0.1  # of the examples; the others are put together
 _MOSAIC_SHARE, _MORE_FISH_SHARE = 0.25, 0.25  # of the examples from frames
-_TURNED_SHARE, _WATER_SHARE = 0.2, 0.3  # of all examples
+_TURNED_SHARE, _WATER_SHARE = 0.25, 0.3  # of all examples
 _BOARD_SHARE, _ON_BOARD_SHARE = 0.3, 0.85  # of examples put together; of boards, with a fish
 _SIZES_PX = (18.0, 560.0)  # of fish put before a background
+# Of those: how many are slimmer, as eels and gars are, or fish seen edge-on; their least depth.
+_SLIM_SHARE, _SLIMMEST = 0.15, 0.4
+_LONGEST_ROW, _ROW_LENGTHS = 14, (0.08, 0.7)  # of fish side by side; of the picture's side
+_EMPTY_SHARE, _ROW_SHARE = 0.1, 0.35  # of backgrounds without a board
 _MOST_FISH = 12
 _MIN_VISIBLE = 0.35  # of a fish; with less it has no box
 _MIN_BOX_PX = 5.0
@@ -154,6 +159,11 @@ def _composed(
     if rng.random() < _BOARD_SHARE:
         return _on_board(rng, picture.astype(np.float32), bank)
     count = int(rng.integers(0, _MOST_FISH + 1) if rng.random() < 0.6 else rng.integers(0, 4))
+    kind = rng.random()
+    if kind < _ROW_SHARE:
+        return _with_layers(rng, _as_deck(rng, picture), np.zeros((0, 4)), _row(rng, bank))
+    if kind < _ROW_SHARE + _EMPTY_SHARE:
+        count = 0
     return _with_fish(rng, picture.astype(np.float32), np.zeros((0, 4)), bank, count=count)
 
 
@@ -216,13 +226,51 @@ def _with_fish(
     *,
     count: int,
 ) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
-    """Fish of the bank before a picture; those in it that they hide have no box any more."""
+    """Fish of the bank, of similar sizes, before a picture."""
     usual = np.exp(rng.uniform(*np.log(_SIZES_PX)))
+    sizes = np.clip(usual * np.exp(rng.normal(0.0, 0.35, count)), *_SIZES_PX)
+    layers = (_placed_fish(rng, bank, size) for size in sizes)
+    return _with_layers(rng, picture, boxes, layers)
+
+
+def _as_deck(rng: np.random.Generator, picture: Image) -> Float32[np.ndarray, "S S 3"]:
+    """A picture that mostly fades into one pale or dark colour, as of a deck or a table."""
+    plain = rng.uniform(0.0, 1.0) * (rng.random() < 0.7)
+    colour = np.clip(rng.uniform(40, 250) + rng.normal(0, 12, 3), 0, 255)
+    return ((1 - plain) * picture + plain * colour).astype(np.float32)
+
+
+def _row(rng: np.random.Generator, bank: PatchBank) -> Iterator[Float32[np.ndarray, "S S 4"]]:
+    """A catch that is laid out: fish side by side, alike, close, mostly parallel."""
+    count = int(rng.integers(2, _LONGEST_ROW + 1))
+    patches = bank.fish[[bank.draw_fish(rng) for _ in range(rng.integers(1, 4))]]
+    depth = np.ptp(np.nonzero((patches[0, ..., 3] > 127).any(axis=1))[0]) / patches.shape[1]
+    slimness = rng.uniform(_SLIMMEST, 1.0) if rng.random() < _SLIM_SHARE else 1.0
+    length = np.exp(rng.uniform(*np.log(_ROW_LENGTHS))) * SIDE_PX
+    step = max(rng.uniform(0.75, 1.5) * depth * slimness * length, 3.0)
+    angle_deg = rng.uniform(0, 360) if rng.random() < 0.3 else rng.normal(0, 15)
+    down = np.array([np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))])
+    middle = rng.uniform(0.2, 0.8, 2) * SIDE_PX
+    heads_deg = 180 * rng.integers(2)
+    for place in step * (np.arange(count) - (count - 1) / 2):
+        patch = patches[rng.integers(len(patches))]
+        turned_deg = angle_deg + rng.normal(0, 6)
+        turned_deg += 180 - heads_deg if rng.random() < 0.1 else heads_deg
+        at = middle + place * down + rng.normal(0, 0.05 * length, 2)
+        size = length * np.exp(rng.normal(0, 0.08))
+        yield _fish_at(patch, size, turned_deg, at, slimness=slimness)
+
+
+def _with_layers(
+    rng: np.random.Generator,
+    picture: Float32[np.ndarray, "S S 3"],
+    boxes: Boxes,
+    layers: Iterable[Float32[np.ndarray, "S S 4"]],
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """Fish before a picture; those in it that they hide have no box any more."""
     owner = np.full((SIDE_PX, SIDE_PX), -1)
     areas = []
-    for index in range(count):
-        size = float(np.clip(usual * np.exp(rng.normal(0.0, 0.35)), *_SIZES_PX))
-        layer = _placed_fish(rng, bank, size)
+    for index, layer in enumerate(layers):
         picture, is_here = _with_layer(rng, picture, layer)
         owner[is_here] = index
         areas.append(int(is_here.sum()))
@@ -269,19 +317,26 @@ def _placed_fish(
     rng: np.random.Generator, bank: PatchBank, size: float
 ) -> Float32[np.ndarray, "S S 4"]:
     """A fish of that length at a random place: BGR times coverage, and coverage."""
-    patch = bank.fish[bank.draw_fish(rng)]
     angle_deg = rng.normal(0.0, 25.0) + 180 * rng.integers(2)
     if rng.random() < 0.3:
         angle_deg = rng.uniform(0, 360)
-    return _fish_at(patch, size, angle_deg, rng.uniform(-0.1, 1.1, 2) * SIDE_PX)
+    slimness = rng.uniform(_SLIMMEST, 1.0) if rng.random() < _SLIM_SHARE else 1.0
+    at = rng.uniform(-0.1, 1.1, 2) * SIDE_PX
+    return _fish_at(bank.fish[bank.draw_fish(rng)], size, angle_deg, at, slimness=slimness)
 
 
 def _fish_at(
-    patch: UInt8[np.ndarray, "P P 4"], size: float, angle_deg: float, at: Float[np.ndarray, "2"]
+    patch: UInt8[np.ndarray, "P P 4"],
+    size: float,
+    angle_deg: float,
+    at: Float[np.ndarray, "2"],
+    *,
+    slimness: float = 1.0,
 ) -> Float32[np.ndarray, "S S 4"]:
     side = patch.shape[0]
-    affine = cv2.getRotationMatrix2D((side / 2, side / 2), angle_deg, size / side)
-    affine[:, 2] += at - side / 2
+    affine = cv2.getRotationMatrix2D((0.0, 0.0), angle_deg, size / side)
+    affine[:, 1] *= slimness
+    affine[:, 2] = at - affine[:, :2] @ (side / 2, side / 2)
     shrink = int(side / size)
     if shrink > 1:  # average pixels that would be skipped
         patch = cv2.blur(patch, (shrink, shrink))
