@@ -117,7 +117,7 @@ class Observation:
         if silhouette is None:
             silhouette = middle_of(y1 - y0, x1 - x0)
         self.area = float(max(1, np.count_nonzero(silhouette)))
-        self.length = oriented_extent(silhouette)[1]
+        self.length = max(1.0, oriented_extent(silhouette)[1])  # a line of pixels has none
         region = image[y0:y1, x0:x1]
         inside = silhouette[: region.shape[0], : region.shape[1]]
         self.colours = colours_of(region, None if candidate.foreground is None else inside)
