@@ -178,7 +178,7 @@ enter, sent = threading.Condition.__enter__, []
 
 def interrupted(condition):
     result = enter(condition)
-    if not sent and threading.current_thread() is threading.main_thread():
+    if not sent and threading.get_ident() == threading.main_thread().ident:
         sent.append(signal.raise_signal(signal.SIGTERM))
     return result
 
