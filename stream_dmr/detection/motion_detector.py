@@ -20,7 +20,7 @@ from stream_dmr.detection.background_model import (
     warp,
 )
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.geometry import components
+from stream_dmr.geometry import components, oriented_extent
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
 
@@ -92,13 +92,14 @@ def _without_poles(
     at_edge = np.pad(is_at_edge, pole_px)
     bodies = _bodies(region, pole_px)
     for thin in _THIN_WIDTHS:
-        if not bodies:
-            bodies = _bodies(region, round(thin * pole_px) | 1)
-            if any(at_edge[body > 0].any() for body in bodies):
-                return []
-            bodies = [body for body in bodies if _is_thick(body)]
+        if bodies:
+            break
+        bodies = _bodies(region, round(thin * pole_px) | 1)
+        if any(at_edge[body > 0].any() for body in bodies):
+            return []
+        bodies = [body for body in bodies if _is_thick(body, _sides_px(body)[1])]
     if not bodies:
-        return [] if (blob & is_at_edge).any() else [blob]
+        return [] if region[at_edge].any() else [blob]
     body_px = [max(cv2.boundingRect(body)[2:]) for body in bodies]
     if len(bodies) == 1 and max(blob.shape) <= body_px[0] + round(_MAX_END_LENGTH * body_px[0]):
         return [blob]
@@ -158,15 +159,16 @@ def _add_free_ends(
             continue
         (i,) = touched
         whole = np.where(part, np.uint8(1), fish[i])
+        breadth_px, length_px = _sides_px(whole)
         is_short = max(stats[label, 2:4]) <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]
-        is_along = _sides_px(whole)[0] <= _MAX_BROADER * _sides_px(bodies[i])[0]
-        if is_short and is_along and _is_thick(whole):
+        is_along = breadth_px <= _MAX_BROADER * _sides_px(bodies[i])[0]
+        if is_short and is_along and _is_thick(whole, length_px):
             fish[i] = whole
 
 
 def _sides_px(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Breadth and length of the smallest rectangle around a blob."""
-    breadth, length = sorted(cv2.minAreaRect(cv2.findNonZero(blob.view(np.uint8)))[1])
+    """Breadth and length of a blob with its outer pixels."""
+    breadth, length = oriented_extent(blob)
     return breadth + 1, length + 1
 
 
@@ -179,11 +181,10 @@ def _refusal(
         return Refusal.SHORT
     if length_px > max_length_px:
         return Refusal.LONG
-    return None if _is_thick(blob) else Refusal.THIN
+    return None if _is_thick(blob, length_px) else Refusal.THIN
 
 
-def _is_thick(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> bool:
-    _, length_px = _sides_px(blob)
+def _is_thick(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"], length_px: float) -> bool:
     thickness_px = np.count_nonzero(blob) / length_px
     return bool(thickness_px >= max(_MIN_THICKNESS * length_px, _MIN_THICKNESS_PX))
 

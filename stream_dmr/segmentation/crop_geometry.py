@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
-from stream_dmr.geometry import components
+from stream_dmr.geometry import components, oriented_extent
 from stream_dmr.messages import FishCrop
 
 _MAX_SAMPLES = 4  # per crop pixel and axis; more changed no mask in tests and cost time
@@ -191,7 +191,7 @@ def is_rectangle(mask: Bool[np.ndarray, "S S"]) -> bool:
     """True for an oblong mask that fills its rectangle with its corners, as labels do."""
     if not mask.any():
         return False
-    breadth, length = sorted(cv2.minAreaRect(cv2.findNonZero(mask.view(np.uint8)))[1])
+    breadth, length = oriented_extent(mask)
     fill = np.count_nonzero(mask) / ((breadth + 1) * (length + 1))
     return bool(length >= 2 * breadth and fill > _RECTANGLE)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.geometry import fraction_inside, whole_pixels
+from stream_dmr.geometry import fraction_inside, oriented_extent, whole_pixels
 from stream_dmr.segmentation.crop_geometry import touches_border
 
 _BINS = 12  # of each channel of L*a*b*
@@ -132,13 +132,3 @@ class Observation:
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         return fraction_inside(self.box, box)
-
-
-def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
-    """Width and length of the smallest rotated rectangle around a shape, px; zeros if empty."""
-    # The outlines have the same hull as all pixels, which are fifty times as many.
-    outlines, _ = cv2.findContours(shape.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    if not outlines:
-        return 0.0, 0.0
-    sides = cv2.minAreaRect(np.concatenate(outlines))[1]
-    return min(sides), max(sides)

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.geometry import components, whole_pixels
-from stream_dmr.tracking.observation import oriented_extent
+from stream_dmr.geometry import components, oriented_extent, whole_pixels
 
 # Chosen on simulated scenes (seeds 900 to 903) and crossings; see docs/research/tracking.md.
 _MIN_VISIBLE_FRACTION = 0.6  # of a predicted silhouette inside the blob; below, the fish is absent

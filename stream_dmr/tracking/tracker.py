@@ -163,9 +163,11 @@ class Tracker:
 
         A gaff hides a fish for some frames, in which it may be hauled faster or slower.
         """
+        if seen.is_piece:
+            return False
         lost = [track for track in self._tracks if track.lost_frames > 1 and track.snapshot is None]
         alike = [track for track in lost if track.cost(seen, is_only_one=True) < IMPOSSIBLE]
-        if seen.is_piece or len(alike) != 1:
+        if len(alike) != 1:
             return False
         if sum(alike[0].cost(other, is_only_one=True) < IMPOSSIBLE for other in others) > 1:
             return False

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.geometry import fraction_inside
-from stream_dmr.tracking.observation import Observation, colours_of, dissimilarity, oriented_extent
+from stream_dmr.geometry import fraction_inside, oriented_extent
+from stream_dmr.tracking.observation import Observation, colours_of, dissimilarity
 from tests.support.frames import ellipse_mask
 
 edges = st.floats(0, 100)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.tracking.observation import oriented_extent
+from stream_dmr.geometry import oriented_extent
 from stream_dmr.tracking.split_blobs import PredictedSilhouette, split_merged_blob
 
 SIZE = (400, 500)

@@ -245,7 +245,7 @@ def _row(rng: np.random.Generator, bank: PatchBank) -> Iterator[Float32[np.ndarr
     count = int(rng.integers(2, _LONGEST_ROW + 1))
     patches = bank.fish[[bank.draw_fish(rng) for _ in range(rng.integers(1, 4))]]
     depth = np.ptp(np.nonzero((patches[0, ..., 3] > 127).any(axis=1))[0]) / patches.shape[1]
-    slimness = rng.uniform(_SLIMMEST, 1.0) if rng.random() < _SLIM_SHARE else 1.0
+    slimness = _slimness(rng)
     length = np.exp(rng.uniform(*np.log(_ROW_LENGTHS))) * SIDE_PX
     step = max(rng.uniform(0.75, 1.5) * depth * slimness * length, 3.0)
     angle_deg = rng.uniform(0, 360) if rng.random() < 0.3 else rng.normal(0, 15)
@@ -320,9 +320,13 @@ def _placed_fish(
     angle_deg = rng.normal(0.0, 25.0) + 180 * rng.integers(2)
     if rng.random() < 0.3:
         angle_deg = rng.uniform(0, 360)
-    slimness = rng.uniform(_SLIMMEST, 1.0) if rng.random() < _SLIM_SHARE else 1.0
+    slimness = _slimness(rng)
     at = rng.uniform(-0.1, 1.1, 2) * SIDE_PX
     return _fish_at(bank.fish[bank.draw_fish(rng)], size, angle_deg, at, slimness=slimness)
+
+
+def _slimness(rng: np.random.Generator) -> float:
+    return rng.uniform(_SLIMMEST, 1.0) if rng.random() < _SLIM_SHARE else 1.0
 
 
 def _fish_at(
