@@ -110,7 +110,7 @@ class Reason(StrEnum):
     POOR_FIT = (
         "poor fit",
         _FRAME,
-        "the mesh overlaps the mask by less than `[localize] min_iou`",
+        "the mesh overlaps the mask by less than `[localize] min_iou`, of slender fish less",
         "look at mask and template",
     )
     UNCERTAIN = (

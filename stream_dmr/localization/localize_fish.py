@@ -13,7 +13,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from stream_dmr.camera import Calibration, ReferencePlane
-from stream_dmr.geometry import arc_length, arc_lengths, bending_ratio
+from stream_dmr.geometry import arc_length, arc_lengths, bending_ratio, misfit
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LocalizedFish
 from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
@@ -43,7 +43,10 @@ class LocalizeSettings(Settings):
         description="length along the bent body; false: chord only, the paper's ablation",
     )
     min_iou: float = Field(
-        default=0.85, ge=0, le=1, description="poorest fit that counts, silhouette IoU with mask"
+        default=0.85,
+        ge=0,
+        le=1,
+        description="poorest fit that counts, silhouette IoU with mask; less of slender fish",
     )
     min_visible_fraction: float = Field(
         default=0.7, ge=0, le=1, description="least visible part of a fish that counts, 0 to 1"
@@ -210,6 +213,7 @@ def locate(
     chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
     length_mm = chord_mm * ratio if settings.bending else chord_mm
     slant_rad = slant(keypoints_mm)
+    missed = misfit(shape.iou, quality.mask_area_px, shape.keypoints_px)
     parts = [
         shape.length_std_ratio,
         # Two joints can't follow every bend, and the outline doesn't show it.
@@ -217,7 +221,7 @@ def locate(
         # The length is the seen length over cos(slant): d log / d slant is tan(slant).
         settings.slant_std_rad * np.tan(slant_rad),
         # A misfit of the body may be anything; little of it is the mask's own roughness.
-        settings.misfit_std * ((1.0 - shape.iou) / 0.1) ** 3,
+        settings.misfit_std * (missed / 0.1) ** 3,
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
     # A fish hangs as far off the plane in its last frame as in its first, so this does not average
@@ -289,6 +293,7 @@ def quality_refusal(
     shape: FittedShape, quality: CropQuality, settings: LocalizeSettings
 ) -> Reason | None:
     """The first gate that a frame fails; None if it passes all."""
+    missed = misfit(shape.iou, quality.mask_area_px, shape.keypoints_px)
     # "not >=" rather than "<", so that NaN fails
     checks = {
         Reason.TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
@@ -296,7 +301,7 @@ def quality_refusal(
         Reason.UNSURE_MASK: quality.mask_confidence is not None
         and not quality.mask_confidence >= settings.min_mask_confidence,
         Reason.END_NOT_SEEN: not (quality.missing_end or 0.0) <= settings.max_missing_end,
-        Reason.POOR_FIT: not shape.iou >= settings.min_iou,
+        Reason.POOR_FIT: not missed <= 1 - settings.min_iou,
         Reason.UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
     }
     return next((reason for reason, failed in checks.items() if failed), None)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
-from stream_dmr.geometry import arc_length
+from stream_dmr.geometry import arc_length, misfit
 from stream_dmr.localization.localize_fish import (
     LocalizeSettings,
     Unlocatable,
@@ -55,6 +55,9 @@ def make_shape(midline_mm, center_mm, camera, *, scale=1e-3, shift=0.0, iou=0.95
 
 
 def make_mesh(shape, *, quality=GOOD, refusal=""):
+    if shape is not None and quality is GOOD:  # a mask a fifth as broad as long
+        area = 0.2 * arc_length(shape.keypoints_px) ** 2
+        quality = replace(GOOD, mask_area_px=area)
     return FittedMesh(
         frame_index=7,
         timestamp_ns=280_000_000,
@@ -231,7 +234,7 @@ def test_a_fit_that_is_not_finite_is_refused(field):
 
 def quality(**changes):
     facts = {"touches_border": False, "visible_fraction": 1.0, "sharpness": 9.0}
-    return CropQuality(**({"mask_area_px": 1e4} | facts | changes))
+    return CropQuality(**({"mask_area_px": 1e5} | facts | changes))
 
 
 @pytest.mark.parametrize(
@@ -257,6 +260,32 @@ def test_gates_name_the_first_reason_and_keep_the_millimetres(changes, shape_cha
     fish = localized(make_mesh(shape, quality=quality(**changes)), calibration)
     assert (fish.reason, fish.accepted) == (reason, reason == "")
     assert fish.length_mm == pytest.approx(700.0)
+
+
+@pytest.mark.parametrize(
+    ("breadth", "iou", "is_accepted"),
+    [(0.3, 0.84, False), (0.11, 0.84, False), (0.06, 0.8, True), (0.06, 0.74, False)],
+)
+def test_slender_fish_may_overlap_less(breadth, iou, is_accepted):
+    """Half a pixel beside the edge of a body 6 pixels broad is an IoU of 0.85."""
+    calibration = make_calibration()
+    shape = straight_fish(calibration, iou=iou).shape
+    head, _, tail = shape.keypoints_px
+    area = breadth * float(np.sum((head - tail) ** 2))
+    fish = localized(make_mesh(shape, quality=quality(mask_area_px=area)), calibration)
+    assert fish.accepted == is_accepted
+
+
+@pytest.mark.parametrize("offset_px", [0.3, 1.0])
+def test_an_edge_off_by_as_many_pixels_is_as_poor_a_fit_of_any_slender_fish(offset_px):
+    axis = np.array([[0.0, 0.0], [40.0, 5.0], [100.0, 0.0]])
+    length = arc_length(axis)
+    found = [
+        misfit(breadth / (breadth + offset_px), breadth * length, axis) for breadth in (6.0, 8.0)
+    ]
+    assert found == pytest.approx([offset_px / (0.1 * length)] * 2, rel=0.15)
+    assert misfit(0.8, 0.3 * length**2, axis) == pytest.approx(0.2)  # as it is, of a broad one
+    assert np.isnan(misfit(np.nan, 600.0, axis))
 
 
 @pytest.mark.parametrize("std_ratio", [np.nan, np.inf])

@@ -25,6 +25,7 @@ from stream_dmr.fitting.solver.contour_solver import ContourSolver
 from stream_dmr.fitting.starts import cold_starts
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.tracks import TrackFitter
+from stream_dmr.geometry import misfit
 from stream_dmr.messages import FishCrop
 from stream_dmr.species import SpeciesSettings
 from stream_dmr.template.template import Template
@@ -295,7 +296,7 @@ def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - num_effective
 
 
-_MIN_IOU = 0.85  # of a fit from which a shape is learnt; chosen
+_MAX_MISFIT = 0.15  # of a fit from which a shape is learnt; chosen
 
 
 def learn_shapes(
@@ -324,7 +325,11 @@ def learn_shapes(
 
     def fitted(chosen: list[FishCrop]) -> FishSamples | None:
         fits = [(crop, shape) for crop in chosen if (shape := tracks.fit(crop).shape) is not None]
-        samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
+        samples = [
+            Sample(crop, shape.parameters)
+            for crop, shape in fits
+            if misfit(shape.iou, crop.quality.mask_area_px, shape.keypoints_px) <= _MAX_MISFIT
+        ]
         if not samples:
             return None
         candidate = fits[-1][1].candidate or 0  # the last fit is decided by all before it
