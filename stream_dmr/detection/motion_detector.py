@@ -158,11 +158,12 @@ def _add_free_ends(
         if len(touched) != 1:
             continue
         (i,) = touched
+        if max(stats[label, 2:4]) > _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]:
+            continue
         whole = np.where(part, np.uint8(1), fish[i])
         breadth_px, length_px = _sides_px(whole)
-        is_short = max(stats[label, 2:4]) <= _MAX_FREE_END / _MAX_END_LENGTH * ends_px[i]
         is_along = breadth_px <= _MAX_BROADER * _sides_px(bodies[i])[0]
-        if is_short and is_along and _is_thick(whole, length_px):
+        if is_along and _is_thick(whole, length_px):
             fish[i] = whole
 
 
