@@ -24,7 +24,7 @@ class SmoothLengthSettings(Settings):
 
     min_frames: int = Field(default=3, ge=1, description="fewest good frames that give a length")
     max_std_ratio: float = Field(
-        default=0.2, gt=0, description="largest std of a length that is given, over length"
+        default=0.17, gt=0, description="largest std of a length that is given, over length"
     )
     max_frames: int = Field(default=2000, ge=1, description="most frames of one fish that are used")
     track_timeout_s: float = Field(
@@ -58,8 +58,14 @@ class SmoothLengthSettings(Settings):
         ge=0,
         description="error that all frames of a fish share beside shape and plane, std over length",
     )
+    std_factor: float = Field(
+        default=0.85,
+        gt=0,
+        description="of the std to which all these parts add up; they overlap, so that stds were "
+        "1.2 to 1.7 times too large for simulated fish that hang",
+    )
     upward_share: float = Field(
-        default=0.7,
+        default=0.62,
         gt=0,
         lt=1,
         description="share of a 95 % interval above its length: a slant that nobody sees makes a "

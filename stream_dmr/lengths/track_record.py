@@ -151,7 +151,8 @@ class TrackLength:
         # Of the log length, by the fish's own shape and distance from the plane.
         ratio = float(np.mean([frame.shared_std_ratio for frame in self._measurements]))
         shared += (ratio * length_mm) ** 2
-        return np.sqrt(variance * self._filter.design_effect + shared)
+        std_mm = np.sqrt(variance * self._filter.design_effect + shared)
+        return self._settings.std_factor * std_mm
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if Reason.NO_CALIBRATION in self._refused:

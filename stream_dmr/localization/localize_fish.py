@@ -89,7 +89,7 @@ class LocalizeSettings(Settings):
         description="std that the misfit of an IoU of 0.9 adds to a length, as a fraction of it",
     )
     max_slant_rad: float = Field(
-        default=1.0, gt=0, description="largest slant of a fish that counts; 0 is broadside, rad"
+        default=0.8, gt=0, description="largest slant of a fish that counts; 0 is broadside, rad"
     )
     max_bow_ratio: float = Field(
         default=0.35,

@@ -348,7 +348,7 @@ _LYING: dict[str, dict[str, Any]] = {
         "misfit_std": 0.03,
         "max_bow_ratio": 0.1,
     },
-    "smooth_length": {"upward_share": 0.5},
+    "smooth_length": {"std_factor": 1.0, "max_std_ratio": 0.2, "upward_share": 0.5},
 }
 # Settings for independent pictures: none follows another, and one good picture suffices. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, except the track.
@@ -368,6 +368,8 @@ _BY_TWO: dict[str, dict[str, Any]] = {
         "frame_correlation": 0.05,
         "correlation_time_s": 0.13,
         "common_std_ratio": 0.007,
+        "std_factor": 1.0,
+        "max_std_ratio": 0.2,
         "upward_share": 0.5,
     }
 }

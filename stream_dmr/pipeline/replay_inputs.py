@@ -38,7 +38,11 @@ _TABLES = {
     "localize": "localize",
 }
 # Values by which runs worked before a setting existed: table, key, value.
-_BEFORE = (("fit_mesh", "hang", "plane"), ("smooth_length", "upward_share", 0.5))
+_BEFORE = (
+    ("fit_mesh", "hang", "plane"),
+    ("smooth_length", "upward_share", 0.5),
+    ("smooth_length", "std_factor", 1.0),
+)
 _KEYS = {"species": {"model": "crop", "forms": "fit"}}  # of tables that several stages use
 
 

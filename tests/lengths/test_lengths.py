@@ -174,7 +174,8 @@ def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
     rng = np.random.default_rng(1)
     apart_s = np.abs(np.subtract.outer(np.arange(15), np.arange(15))) * FRAME_NS / 1e9
     alike = np.linalg.cholesky(lasting + (1 - lasting) * np.exp(-apart_s / tau_s))
-    changes = {"frame_correlation": lasting, "correlation_time_s": tau_s, "upward_share": 0.5}
+    changes = {"frame_correlation": lasting, "correlation_time_s": tau_s}
+    changes |= {"std_factor": 1.0, "upward_share": 0.5}
     hits, nees = [], []
     for truth in rng.uniform(400, 1200, 300):
         std = truth * rng.uniform(0.02, 0.06, 15)
@@ -232,11 +233,14 @@ def test_overconfident_fits_are_widened_by_their_own_scatter():
 
 def test_common_error_does_not_average_out():
     frames = [frame(i, 700.0) for i in range(1, 400)]
-    final = run(frames, common_std_ratio=0.02, upward_share=0.5, **ALL_NEW)[-1]
+    whole = {"common_std_ratio": 0.02, "std_factor": 1.0} | ALL_NEW
+    final = run(frames, upward_share=0.5, **whole)[-1]
     assert final.length_std_mm == pytest.approx(14.0, rel=0.01)
     np.testing.assert_allclose(final.ci95_mm, [700 - 27.5, 700 + 27.5], atol=0.3)
-    final = run(frames, common_std_ratio=0.02, upward_share=0.6, **ALL_NEW)[-1]
+    final = run(frames, upward_share=0.6, **whole)[-1]
     np.testing.assert_allclose(final.ci95_mm, [700 - 22.0, 700 + 33.0], atol=0.3)
+    final = run(frames, upward_share=0.6, **whole | {"std_factor": 0.5})[-1]
+    np.testing.assert_allclose(final.ci95_mm, [700 - 11.0, 700 + 16.5], atol=0.15)
 
 
 def test_no_frame_has_a_smaller_std_than_the_floor():
@@ -334,8 +338,8 @@ def test_message_is_immutable():
 def test_what_is_not_known_of_the_shape_widens_the_interval_however_many_frames(count):
     """An error that all frames share: it is added to the variance and does not average out."""
     frames = [frame(index, 700.0) for index in range(1, count + 1)]
-    known = run(frames)[-1]
-    unknown = run([replace(fish, shared_std_ratio=0.03) for fish in frames])[-1]
+    known = run(frames, std_factor=1.0)[-1]
+    unknown = run([replace(fish, shared_std_ratio=0.03) for fish in frames], std_factor=1.0)[-1]
     assert unknown.length_mm == known.length_mm
     added = unknown.length_std_mm**2 - known.length_std_mm**2
     assert added == pytest.approx((0.03 * 700.0) ** 2, rel=1e-9)
