@@ -42,7 +42,7 @@ def type_after(tab: Tab, key: str, text: str) -> None:
     tab.send("Input.dispatchKeyEvent", type="keyDown", **enter)
     tab.run(
         "const said = document.getElementById('message');"
-        "for (let i = 0; i < 200 && said.textContent !== 'Saved.'; i++)"
+        "for (let i = 0; i < 200 && said.textContent === ''; i++)"
         " await new Promise((done) => setTimeout(done, 20)); said.textContent = ''"
     )
 
