@@ -89,6 +89,12 @@ class FitMeshSettings(Settings):
         gt=0,
         description="length along the edge over which its errors are correlated, crop pixels",
     )
+    edge_shift_px: float = Field(
+        default=0.3,
+        ge=0,
+        description="std by which all of a mask's edge is too far out or in, crop pixels: of slender "
+        "fish a part of their breadth, which must not become a slant",
+    )
 
     @property
     def scans_sizes(self) -> bool:

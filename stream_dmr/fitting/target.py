@@ -122,6 +122,7 @@ _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short besid
 _REACH = 4  # of the smoothing's kernel, px
 _SPACING_PX = 2.0  # between two points of the contour; chosen
 _FEWEST = 8  # pixels of an edge: less is a speck
+_LEAST_HALF_PX = 1.0  # half the breadth of the slimmest fish of a mask that is fitted
 _BORDER_PX = 0.6  # nearer to the picture's border there is no edge of the fish, only of the picture
 
 
@@ -140,11 +141,14 @@ class Target(NamedTuple):
     contour: Float[np.ndarray, "C 2"]  # points on the mask's edge, px
     contour_normals: Float[np.ndarray, "C 2"]  # outward
     contour_lengths: Float[np.ndarray, "C"]  # px of edge that each point stands for
+    half_breadth_px: float  # the mask's area over its edge's length, px of the crop
 
     @classmethod
     def from_crop(cls, crop: FishCrop, *, plane_normal: Float[np.ndarray, "3"]) -> "Target":
         """Distance map, contour, heading and camera of a crop with a mask."""
         unknown = np.zeros((0, 0), bool) if crop.unknown is None else crop.unknown.copy()
+        contour, normals, lengths = mask_contour(crop.mask, crop.unknown)
+        area = float(np.count_nonzero(crop.mask))
         return cls(
             crop.crop_camera.K.copy(),  # see Body.from_template
             crop.crop_camera.middle_ray(),
@@ -153,8 +157,11 @@ class Target(NamedTuple):
             crop.mask.astype(np.float64),
             unknown,
             _distance(crop.mask, crop.unknown),
-            float(np.count_nonzero(crop.mask)),
-            *mask_contour(crop.mask, crop.unknown),
+            area,
+            contour,
+            normals,
+            lengths,
+            max(area / max(float(lengths.sum()), 1.0), _LEAST_HALF_PX),
         )
 
     def coarse(self) -> "Target":

@@ -161,6 +161,7 @@ def _compile_largest() -> None:
         flat,
         flat,
         lengths,
+        1.0,
     )
     problem = Problem.from_settings(settings, body, target, with_smoothness=True)
     rendering = Rendering(points, flat, np.zeros((0, 2), np.int64), picture, points, points)

@@ -40,6 +40,7 @@ _TABLES = {
 # Values by which runs worked before a setting existed: table, key, value.
 _BEFORE = (
     ("fit_mesh", "hang", "plane"),
+    ("fit_mesh", "edge_shift_px", 0.0),
     ("smooth_length", "upward_share", 0.5),
     ("smooth_length", "std_factor", 1.0),
 )

@@ -18,6 +18,7 @@ model = "mine.onnx"
 forms = ["HAP=halibut"]
 [fit_mesh]
 hang = "camera"
+edge_shift_px = 0.3
 min_mask_px = 11
 [localize]
 min_iou = 0.5

@@ -26,6 +26,7 @@ min_mask_px = 10
 [localize]
 min_iou = 0.0
 max_length_std_ratio = 1e9
+max_slant_rad = 2.0
 """
 
 

@@ -5,8 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stream_dmr.fitting.body import MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.solver.problem import SCALE, Problem
+from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import form_std_ratio, freed, slant_std_ratio
+from stream_dmr.template.template_file import load_template
+from tests.support.shapes import crop_from_mask
 
 
 def test_with_a_known_breadth_no_slant_is_hidden():
@@ -34,6 +39,37 @@ def test_joints_are_as_free_as_the_breadth_is_unknown():
     variance = settings.nat / (2 * settings.lambda_scale)
     loose = freed(settings, 0.1**2)
     assert settings.nat / (2 * loose.lambda_scale) == pytest.approx(variance + 0.1**2)
+
+
+def test_joints_are_as_free_as_a_shift_of_the_edge_makes_the_breadth_unknown():
+    """A bar 8 px broad whose edge may be 0.4 px off is known to a tenth in breadth."""
+    mask = np.zeros((128, 128), bool)
+    mask[60:68, 4:124] = True
+    settings = FitMeshSettings(edge_shift_px=0.4)
+    body = MeshLevels.from_template(load_template("halibut"), max_faces=600).coarse
+    target = Target.from_crop(crop_from_mask(mask), plane_normal=np.array([0.0, 0.0, 1.0]))
+    fine, half, firm = (
+        Problem.from_settings(chosen, body, seen, with_smoothness=False).lambdas[SCALE]
+        for chosen, seen in (
+            (settings, target),
+            (settings, target.coarse()),
+            (settings.model_copy(update={"edge_shift_px": 0.0}), target),
+        )
+    )
+    assert fine == half < firm == settings.lambda_scale
+    nat, variance = settings.nat, settings.nat / (2 * firm)
+    assert nat / (2 * fine) == pytest.approx(variance + 0.1**2, rel=0.15)
+
+
+@pytest.mark.parametrize("changes", [{"prior_weight": 0.0}, {"lambda_scale": 0.0}])
+def test_the_papers_loss_has_its_own_weights(changes):
+    settings = FitMeshSettings(**changes)
+    body = MeshLevels.from_template(load_template("halibut"), max_faces=600).coarse
+    mask = np.zeros((64, 64), bool)
+    mask[28:36, 4:60] = True
+    target = Target.from_crop(crop_from_mask(mask), plane_normal=np.array([0.0, 0.0, 1.0]))
+    problem = Problem.from_settings(settings, body, target, with_smoothness=True)
+    np.testing.assert_array_equal(problem.lambdas, settings.lambdas())
 
 
 def test_where_the_form_is_certain_the_choice_adds_nothing():
