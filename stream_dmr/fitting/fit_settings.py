@@ -92,8 +92,8 @@ class FitMeshSettings(Settings):
     edge_shift_px: float = Field(
         default=0.3,
         ge=0,
-        description="std by which all of a mask's edge is too far out or in, crop pixels: of slender "
-        "fish a part of their breadth, which must not become a slant",
+        description="std by which all of a mask's edge is too far out or in, crop pixels: of "
+        "slender fish a part of their breadth, which must not become a slant",
     )
 
     @property
