@@ -346,6 +346,7 @@ _LYING: dict[str, dict[str, Any]] = {
         "plane_std_mm": 3.0,
         "slant_std_rad": 0.03,
         "misfit_std": 0.03,
+        "max_slant_rad": 1.0,  # on a deck seen from aside, not by the fit
         "max_bow_ratio": 0.1,
     },
     "smooth_length": {"std_factor": 1.0, "max_std_ratio": 0.2, "upward_share": 0.5},

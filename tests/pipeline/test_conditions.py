@@ -25,6 +25,7 @@ def test_lying_fish_rest_on_the_plane_and_hardly_tilt():
     assert config.fit_mesh.tilt_std_rad < Config().fit_mesh.tilt_std_rad
     assert config.fit_mesh.arch_std_rad < 0.2 * config.fit_mesh.bend_std_rad
     assert config.smooth_length.upward_share == 0.5
+    assert config.localize.max_slant_rad > Config().localize.max_slant_rad  # decks seen from aside
 
 
 def test_one_good_still_gives_a_length():
