@@ -127,6 +127,17 @@ class FitMeshSettings(Settings):
         """
         return self.prior_weight * self.edge_std_px**2
 
+    def freed_lambda_scale(self, breadth_variance: float) -> float:
+        """`lambda_scale` if the joints' scales may also differ by a variance of the log breadth.
+
+        L_s = lambda (e^s - 1)^2 lets a log scale have the variance nat / (2 lambda), to which this
+        one is added.
+        """
+        if breadth_variance == 0 or self.lambda_scale == 0:
+            return self.lambda_scale
+        variance = self.nat / (2 * self.lambda_scale) + breadth_variance
+        return self.nat / (2 * variance)
+
     def priors(self) -> Priors:
         """Priors of tilt, bends and skinning weights; L_t and L_s hold joints' other parameters."""
         std = np.full(NUM_PER_JOINT, np.inf)

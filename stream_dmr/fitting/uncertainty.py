@@ -115,15 +115,10 @@ def _log_length_slope(
 
 
 def freed(settings: FitMeshSettings, breadth_variance: float) -> FitMeshSettings:
-    """Settings in which the joints' scales may also differ by the uncertainty of the breadth.
-
-    L_s = lambda (e^s - 1)^2 lets a log scale have the variance nat / (2 lambda), to which the
-    variance of the log breadth is added.
-    """
-    if breadth_variance == 0 or settings.lambda_scale == 0:
-        return settings
-    variance = settings.nat / (2 * settings.lambda_scale) + breadth_variance
-    return settings.model_copy(update={"lambda_scale": settings.nat / (2 * variance)})
+    """Settings in which the joints' scales may also differ by the uncertainty of the breadth."""
+    return settings.model_copy(
+        update={"lambda_scale": settings.freed_lambda_scale(breadth_variance)}
+    )
 
 
 _SLANTS_RAD = np.linspace(0.0, 1.2, 61)

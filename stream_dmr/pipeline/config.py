@@ -330,6 +330,8 @@ def _toml_name(value: object) -> str:
             return f"{value}"
 
 
+# Of `[smooth_length]`, for fish whose slant is known.
+_NO_HIDDEN_SLANT: dict[str, Any] = {"std_factor": 1.0, "max_std_ratio": 0.2, "upward_share": 0.5}
 # Settings for fish that lie on the reference plane, by table. Gravity holds them flat to a degree
 # or two, so they bend within the plane and hardly out of it; they are as far off it as the plane
 # was measured wrongly. Misfit comes from their fins, not from bends that nobody sees.
@@ -349,7 +351,7 @@ _LYING: dict[str, dict[str, Any]] = {
         "max_slant_rad": 1.0,  # on a deck seen from aside, not by the fit
         "max_bow_ratio": 0.1,
     },
-    "smooth_length": {"std_factor": 1.0, "max_std_ratio": 0.2, "upward_share": 0.5},
+    "smooth_length": _NO_HIDDEN_SLANT,
 }
 # Settings for independent pictures: none follows another, and one good picture suffices. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, except the track.
@@ -369,10 +371,8 @@ _BY_TWO: dict[str, dict[str, Any]] = {
         "frame_correlation": 0.05,
         "correlation_time_s": 0.13,
         "common_std_ratio": 0.007,
-        "std_factor": 1.0,
-        "max_std_ratio": 0.2,
-        "upward_share": 0.5,
     }
+    | _NO_HIDDEN_SLANT
 }
 
 

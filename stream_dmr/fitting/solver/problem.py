@@ -49,9 +49,9 @@ class Problem(NamedTuple):
         # Frozen settings have a hash, which pydantic does not declare.
         lambdas, priors = _weights(settings, with_smoothness)  # pyright: ignore[reportArgumentType]
         shift_std = settings.edge_shift_px / target.half_breadth_px  # of the log breadth
-        if shift_std > 0 and settings.nat > 0 and lambdas[SCALE] > 0:
+        if shift_std > 0 and settings.nat > 0:  # else it is the paper's loss
             lambdas = lambdas.copy()
-            lambdas[SCALE] = settings.nat / (settings.nat / lambdas[SCALE] + 2 * shift_std**2)
+            lambdas[SCALE] = settings.freed_lambda_scale(shift_std**2)
         kind, rest = KINDS[settings.deformation], _rest(len(body.joints))
         return cls(body, kind, target, lambdas, priors, rest)
 
