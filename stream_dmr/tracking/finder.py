@@ -28,7 +28,7 @@ from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.detection.network_detectors import OnnxDetector
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.detection.picture_views import find_in_still
-from stream_dmr.geometry import whole_pixels
+from stream_dmr.geometry import box_iou, whole_pixels
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.tracking.box_correction import BoxCorrector
@@ -124,6 +124,8 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
 
     Both cameras have the frame camera's orientation and no distortion.
     """
+    if box_iou(crop.bbox_xyxy_px, other.bbox_xyxy_px) == 0:
+        return 0.0
     crop_from_other = crop.crop_camera.K @ np.linalg.inv(other.crop_camera.K)
     seen = cv2.warpAffine(
         other.mask.view(np.uint8) * np.uint8(255), crop_from_other[:2], crop.mask.shape[::-1]
@@ -230,8 +232,12 @@ class TrackedFish:
         self._confirmation.forget_all_but(self._tracker.open_numbers)
         fish = {
             track: shown
-            for track, crop in crops.items()
-            if (shown := self._confirmation.update(track, crop, may_count=self._may_count(track)))
+            for track in self._without_parts(crops)
+            if (
+                shown := self._confirmation.update(
+                    track, crops[track], may_count=self._may_count(track)
+                )
+            )
         }
         if self._are_stills:
             single = without_repeats({track: crops[track] for track in fish}, self._scores)
@@ -241,6 +247,25 @@ class TrackedFish:
         confidences = [crop.quality.mask_confidence or 0.0 for crop in crops.values()]
         self._seen.best_confidence = max([self._seen.best_confidence, *confidences])
         return fish
+
+    def _without_parts(self, crops: Mapping[int, FishCrop]) -> Collection[int]:
+        """The tracks of a film's frame, without those that follow a part of a confirmed fish.
+
+        A fish that rests and moves its head is one fish.
+        """
+        if not self._settings.across_frames or isinstance(self._detector, BoxDetector):
+            return crops
+        area_px = {track: crop.quality.mask_area_px for track, crop in crops.items()}
+        sure = [track for track in crops if self._confirmation.is_confirmed(track)]
+        return [
+            track
+            for track, crop in crops.items()
+            if not any(
+                share_inside(crop, crops[fish]) > _SAME
+                for fish in sure
+                if fish != track and (track not in sure or area_px[fish] > area_px[track])
+            )
+        ]
 
     @property
     def has_masks(self) -> bool:

@@ -200,8 +200,8 @@ def test_a_shape_may_be_no_fish_until_it_is_confirmed_or_went_far():
     assert doubts_of(1.0, has_place=False, across_frames=False) == [True] * 8  # one picture alone
 
 
-@pytest.mark.parametrize(("across_frames", "num_fish"), [(False, 2), (True, 3)])
-def test_a_still_shows_no_fish_inside_of_another(across_frames: bool, num_fish: int):
+@pytest.mark.parametrize("across_frames", [False, True])
+def test_a_picture_shows_no_fish_inside_of_another(across_frames: bool):
     class Boxes:
         refused: ClassVar[dict[str, int]] = {}
 
@@ -216,8 +216,10 @@ def test_a_still_shows_no_fish_inside_of_another(across_frames: bool, num_fish: 
 
     # A still counts what only the whole picture shows, not the mirrored one and closer looks.
     settings = TrackFishSettings(min_track_frames=1, across_frames=across_frames, min_score=0.05)
-    fish, frame = TrackedFish(Boxes(), settings), marked_frame(1)
-    assert len(fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))) == num_fish
+    fish = TrackedFish(Boxes(), settings)
+    for frame in map(marked_frame, (1, 2)):  # in a film only what counts already hides its parts
+        shown = fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
+    assert len(shown) == 2
 
 
 class BlindFromAfar(FusedDetector):
