@@ -23,9 +23,10 @@ _MAX_KEPT_CROPS = 10  # of a track that is not confirmed; chosen
 # After so many frames in a row with empty or very doubtful masks, a track follows another thing:
 # the place where its fish was. Simulated fish are unclear in at most three frames in a row.
 _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
-# Share of a track's frames: a lamp or a leaf that is seen for hours is clear in four of them. All
-# real fish but one were clear in a seventh and more when confirmed; docs/research/tracking.md.
-_MIN_CLEAR_SHARE = 0.1
+# Share of a track's frames whose mask is surer by so much than one in which it is clear. A lamp or
+# a leaf that is seen for hours is clear in four frames, a weed that sways in one of three or four.
+# Of 63 real fish all but one were so sure in a quarter of them; see docs/research/tracking.md.
+_MIN_SURE_SHARE, _SURER = 0.25, 0.08
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -69,6 +70,7 @@ class FishConfirmation:
         self._confirmed: set[int] = set()  # track numbers
         self._num_frames: Counter[int] = Counter()  # of unconfirmed tracks
         self._num_clear_frames: Counter[int] = Counter()  # likewise
+        self._num_sure_frames: Counter[int] = Counter()  # likewise
         self._clear_crops: dict[int, deque[FishCrop]] = {}  # likewise, the latest
         self._num_empty_frames: Counter[int] = Counter()  # of confirmed tracks, in a row
 
@@ -86,7 +88,10 @@ class FishConfirmation:
         earlier: list[FishCrop] = []
         if number not in self._confirmed:
             self._num_frames[number] += 1
-            if confidence is None or confidence >= self._settings.min_mask_confidence:
+            clear = self._settings.min_mask_confidence
+            if confidence is None or confidence >= clear + _SURER:
+                self._num_sure_frames[number] += 1
+            if confidence is None or confidence >= clear:
                 self._num_clear_frames[number] += 1
                 kept = self._clear_crops.setdefault(number, deque(maxlen=_MAX_KEPT_CROPS))
                 kept.append(crop)
@@ -94,6 +99,7 @@ class FishConfirmation:
                 return []
             self._confirmed.add(number)
             del self._num_frames[number], self._num_clear_frames[number]
+            del self._num_sure_frames[number]
             earlier = [old for old in self._clear_crops.pop(number, ()) if old is not crop]
         if confidence is None or confidence >= _NOTHING:
             self._num_empty_frames.pop(number, None)
@@ -105,6 +111,7 @@ class FishConfirmation:
         """Forget the crops of all other tracks that are not confirmed."""
         for number in [n for n in self._num_frames if n not in numbers]:
             del self._num_frames[number], self._num_clear_frames[number]
+            del self._num_sure_frames[number]
             self._clear_crops.pop(number, None)
 
     def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
@@ -115,9 +122,9 @@ class FishConfirmation:
             left * width <= (x0 + x1) / 2 <= right * width
             and top * height <= (y0 + y1) / 2 <= bottom * height
         )
-        share = _MIN_CLEAR_SHARE * self._num_frames[number]
-        needed = max(self._settings.min_track_frames, share)
-        return is_in_zone and self._num_clear_frames[number] >= needed
+        is_sure = self._num_sure_frames[number] >= _MIN_SURE_SHARE * self._num_frames[number]
+        is_clear = self._num_clear_frames[number] >= self._settings.min_track_frames
+        return is_in_zone and is_clear and is_sure
 
 
 # Of how much it looks like a fish: in a picture of the whole frame, where other things do as well,
@@ -126,7 +133,7 @@ _SURE, _FISH_LIKE = 0.6, 0.2
 _MIN_SURE_FRAMES, _MAX_CLOSER_LOOKS = 4, 8
 # Share of all frames: a stone that is seen for hours looks like a fish in a few of them. Chosen;
 # visible fish in real clips look like a fish in 40 % of their frames and more.
-_MIN_SURE_SHARE, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
+_MIN_SURE_LOOKS, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
 # Sizes from the place where it was first seen. A candidate that went far is cut out in its own box
 # alone, since the network for masks loses a thin fish in a wider box.
 _MIN_MOTION = 0.25
@@ -182,7 +189,7 @@ class FishEvidence:
     @property
     def _is_sure(self) -> bool:
         """True if it was given, or looked like a fish often enough."""
-        needed = max(_MIN_SURE_FRAMES, _MIN_SURE_SHARE * self._judged_frames)
+        needed = max(_MIN_SURE_FRAMES, _MIN_SURE_LOOKS * self._judged_frames)
         return self._need_not_move or self._sure_frames >= needed
 
     def looks_like_a_fish(self, min_frames: int) -> bool:

@@ -100,7 +100,7 @@ def explain_no_fish(
         )
     return begin + (
         f"{seen.tracks} shapes were followed, none with a sure mask in "
-        f"{settings.min_track_frames} frames and a tenth of all within the zone; lower "
+        f"{settings.min_track_frames} frames and a quarter of all within the zone; lower "
         "[track_fish] min_track_frames, or widen zone; --stills for single pictures"
     )
 

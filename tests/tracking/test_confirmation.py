@@ -30,8 +30,8 @@ def confirmed(crops: Sequence[FishCrop], **settings: object) -> list[bool]:
 
 
 def test_a_track_is_confirmed_after_enough_clear_frames():
-    unclear, clear = crop_at(50, 50, confidence=0.51), crop_at(50, 50, confidence=0.52)
-    crops = [clear, unclear, clear, unclear, unclear, clear, unclear]
+    unclear, clear, sure = (crop_at(50, 50, confidence=c) for c in (0.51, 0.52, 0.6))
+    crops = [sure, unclear, sure, unclear, unclear, clear, unclear]
     assert confirmed(crops, min_track_frames=3) == [False] * 5 + [True] * 2
 
 
@@ -82,10 +82,13 @@ def test_what_is_long_no_fish_keeps_few_crops():
 
 def test_what_is_hardly_ever_clear_is_no_fish():
     unclear, clear = crop_at(50, 50, confidence=0.3), crop_at(50, 50)
-    rarely = [*[unclear] * 15, clear] * 30
+    rarely = [*[unclear] * 4, clear] * 30
     assert not any(confirmed(rarely, min_track_frames=4))
-    often = [*[unclear] * 5, clear] * 4
-    assert confirmed(often, min_track_frames=4) == [False] * 23 + [True]
+    often = [*[unclear] * 2, clear] * 4
+    assert confirmed(often, min_track_frames=4) == [False] * 11 + [True]
+    barely = crop_at(50, 50, confidence=0.59)
+    assert not any(confirmed([barely] * 30, min_track_frames=4))
+    assert any(confirmed([barely] * 30, min_track_frames=4, min_mask_confidence=0.51))
 
 
 def test_tracks_that_have_ended_are_forgotten():

@@ -115,7 +115,7 @@ def test_a_fish_is_open_until_the_tracker_drops_it():
 def test_what_never_looks_like_a_fish_does_not_count():
     frames = [[climbing(i)] for i in range(20)]
     assert ids(follow(frames, confidence=0.7, min_track_frames=4)) == [[]] * 20
-    assert ids(follow(frames, confidence=0.7, min_mask_confidence=0.3)) == [[1]] * 20
+    assert ids(follow(frames, confidence=0.7, min_mask_confidence=0.2)) == [[1]] * 20
 
 
 def test_fish_count_in_the_zone_and_keep_their_ids_outside():
@@ -150,7 +150,8 @@ def test_a_box_is_corrected_by_the_last_confident_mask_by_a_tenth_at_most(
             probability[max(y0, 0) : y1 + (y1 - y0) // 8, max(x0, 0) : x1] = confidence
             return SegmentedFish(probability=probability, ends=None)
 
-    found = follow([[climbing(i)] for i in range(10)], segmenter=Longer())
+    frames = [[climbing(i)] for i in range(10)]
+    found = follow(frames, segmenter=Longer(), min_mask_confidence=0.4)
     for i in range(2, 11):
         x, y, w, h, _ = climbing(i - 1)
         edges = [x - w / 2, y - h / 2, x + w / 2, y + h / 2 + beyond]
