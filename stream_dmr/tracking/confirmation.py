@@ -122,7 +122,8 @@ class FishConfirmation:
             left * width <= (x0 + x1) / 2 <= right * width
             and top * height <= (y0 + y1) / 2 <= bottom * height
         )
-        is_sure = self._num_sure_frames[number] >= _MIN_SURE_SHARE * self._num_frames[number]
+        num_frames = self._num_frames[number]  # 1 in a still, which shows a fish once
+        is_sure = num_frames == 1 or self._num_sure_frames[number] >= _MIN_SURE_SHARE * num_frames
         is_clear = self._num_clear_frames[number] >= self._settings.min_track_frames
         return is_in_zone and is_clear and is_sure
 

@@ -88,6 +88,7 @@ def test_what_is_hardly_ever_clear_is_no_fish():
     assert confirmed(often, min_track_frames=4) == [False] * 11 + [True]
     barely = crop_at(50, 50, confidence=0.59)
     assert not any(confirmed([barely] * 30, min_track_frames=4))
+    assert confirmed([barely], min_track_frames=1) == [True]  # a still
     assert any(confirmed([barely] * 30, min_track_frames=4, min_mask_confidence=0.51))
 
 
