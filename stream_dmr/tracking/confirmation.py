@@ -98,9 +98,7 @@ class FishConfirmation:
             if not (may_count and self._is_confirmed_by(number, crop)):
                 return []
             self._confirmed.add(number)
-            del self._num_frames[number], self._num_clear_frames[number]
-            del self._num_sure_frames[number]
-            earlier = [old for old in self._clear_crops.pop(number, ()) if old is not crop]
+            earlier = [old for old in self._forget(number) if old is not crop]
         if confidence is None or confidence >= _NOTHING:
             self._num_empty_frames.pop(number, None)
         else:
@@ -110,9 +108,13 @@ class FishConfirmation:
     def forget_all_but(self, numbers: Collection[int]) -> None:
         """Forget the crops of all other tracks that are not confirmed."""
         for number in [n for n in self._num_frames if n not in numbers]:
-            del self._num_frames[number], self._num_clear_frames[number]
-            del self._num_sure_frames[number]
-            self._clear_crops.pop(number, None)
+            self._forget(number)
+
+    def _forget(self, number: int) -> Collection[FishCrop]:
+        """Forget what was counted of an unconfirmed track; return its clear crops."""
+        del self._num_frames[number], self._num_clear_frames[number]
+        del self._num_sure_frames[number]
+        return self._clear_crops.pop(number, ())
 
     def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height
