@@ -123,17 +123,19 @@ class FitMeshSettings(Settings):
         """The L_rec that is worth one nat of likelihood.
 
         With edges that are off by a pixel it is `prior_weight`, since the priors' halved squares
-        are nats themselves. Rougher edges contain less information.
+        are nats themselves. Rougher edges contain less information. The paper's loss, which has no
+        priors, is weighed as by the default.
         """
-        return self.prior_weight * self.edge_std_px**2
+        weight = self.prior_weight or float(type(self).model_fields["prior_weight"].default)
+        return weight * self.edge_std_px**2
 
     def freed_lambda_scale(self, breadth_variance: float) -> float:
         """`lambda_scale` if the joints' scales may also differ by a variance of the log breadth.
 
         L_s = lambda (e^s - 1)^2 lets a log scale have the variance nat / (2 lambda), to which this
-        one is added.
+        one is added. The paper's loss stays as it is.
         """
-        if breadth_variance == 0 or self.lambda_scale == 0:
+        if 0 in (breadth_variance, self.lambda_scale, self.prior_weight):
             return self.lambda_scale
         variance = self.nat / (2 * self.lambda_scale) + breadth_variance
         return self.nat / (2 * variance)

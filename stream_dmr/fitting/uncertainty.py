@@ -54,10 +54,8 @@ def _prior_precisions(settings: FitMeshSettings, num_joints: int) -> Float[np.nd
     """One over the variances that the parameters have a priori."""
     joint = np.empty(NUM_PER_JOINT)
     joint[JOINT_ROTATION] = _JOINT_ROTATION_STD**-2
-    # L_t, lambda t^2 in nats, is t^2 precision / 2. Without priors L_rec is not in nats, and the
-    # default settings' priors are taken.
-    nat = settings.nat or FitMeshSettings().nat
-    joint[JOINT_TRANSLATION] = 2 * settings.lambda_translation / nat
+    # L_t, lambda t^2 in nats, is t^2 precision / 2.
+    joint[JOINT_TRANSLATION] = 2 * settings.lambda_translation / settings.nat
     joint[JOINT_LOG_SCALE] = _JOINT_LOG_SCALE_STD**-2
     joint[JOINT_WEIGHT] = _JOINT_WEIGHT_STD**-2
     return np.concatenate([np.array(_ROOT_STD) ** -2.0, np.tile(joint, num_joints)])

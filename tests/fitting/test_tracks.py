@@ -31,10 +31,14 @@ def test_fish_hang_facing_the_camera_or_in_the_plane(hang, lean):
     assert np.arccos(abs(normal[2])) == pytest.approx(lean)
 
 
-@pytest.mark.parametrize(("log_factor", "candidate"), [(-0.3, 0), (0.3, 1)])
-def test_a_fish_is_given_the_shape_that_it_has(log_factor, candidate):
+@pytest.mark.parametrize(
+    ("log_factor", "candidate", "prior_weight"),
+    [(-0.3, 0, SETTINGS.prior_weight), (0.3, 1, SETTINGS.prior_weight), (0.3, 1, 0.0)],
+)
+def test_a_fish_is_given_the_shape_that_it_has(log_factor, candidate, prior_weight):
     shapes = candidates(fore=tapered(-0.3), aft=tapered(0.3))
-    fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=shapes)
+    settings = SETTINGS.model_copy(update={"prior_weight": prior_weight})  # 0: the paper's loss
+    fitter = TrackFitter(TEMPLATE, settings, calibration=None, candidates=shapes)
     shapes = shapes_of(fitter, fish_of(tapered(log_factor), track_id=4, num_frames=4))
     assert shapes[-1].candidate == candidate
     assert shapes[-1].iou > 0.9

@@ -49,7 +49,7 @@ class Problem(NamedTuple):
         # Frozen settings have a hash, which pydantic does not declare.
         lambdas, priors = _weights(settings, with_smoothness)  # pyright: ignore[reportArgumentType]
         shift_std = settings.edge_shift_px / target.half_breadth_px  # of the log breadth
-        if shift_std > 0 and settings.nat > 0:  # else it is the paper's loss
+        if shift_std > 0:
             lambdas = lambdas.copy()
             lambdas[SCALE] = settings.freed_lambda_scale(shift_std**2)
         kind, rest = KINDS[settings.deformation], _rest(len(body.joints))

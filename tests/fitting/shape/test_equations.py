@@ -20,7 +20,7 @@ from stream_dmr.fitting.solver.contour_solver import loss_of
 from stream_dmr.fitting.solver.descent import evaluate, normal_equations
 from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.uncertainty import freed, shape_std_ratio
+from stream_dmr.fitting.uncertainty import shape_std_ratio
 from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader, fish_of
 
 SETTINGS = FitMeshSettings()
@@ -83,15 +83,6 @@ def test_a_length_is_as_uncertain_as_the_shape(sample):
     assert twice == pytest.approx(2 * std)
     more = covariance + np.diag(np.full(NUM_COEFFICIENTS, 0.01))
     assert shape_std_ratio(problem, sample.pose, SLOPES, more) > std
-
-
-def test_joints_scales_are_as_free_as_the_breadth_is_unknown():
-    assert freed(SETTINGS, 0.0) == SETTINGS
-    less = freed(SETTINGS, 0.1**2)
-    variances = [SETTINGS.nat / (2 * s.lambda_scale) for s in (SETTINGS, less)]
-    assert variances[1] - variances[0] == pytest.approx(0.1**2)
-    free = SETTINGS.model_copy(update={"lambda_scale": 0.0})
-    assert freed(free, 0.1**2) == free
 
 
 @pytest.mark.parametrize("largest", [1e2, 1e11])

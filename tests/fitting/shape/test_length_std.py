@@ -39,6 +39,9 @@ def test_joints_are_as_free_as_the_breadth_is_unknown():
     variance = settings.nat / (2 * settings.lambda_scale)
     loose = freed(settings, 0.1**2)
     assert settings.nat / (2 * loose.lambda_scale) == pytest.approx(variance + 0.1**2)
+    for fixed in ({"lambda_scale": 0.0}, {"prior_weight": 0.0}):
+        kept = settings.model_copy(update=fixed)
+        assert freed(kept, 0.1**2) == kept
 
 
 def test_joints_are_as_free_as_a_shift_of_the_edge_makes_the_breadth_unknown():
