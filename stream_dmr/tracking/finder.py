@@ -28,6 +28,7 @@ from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.detection.network_detectors import OnnxDetector
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.detection.picture_views import find_in_still
+from stream_dmr.errors import ConfigError
 from stream_dmr.geometry import box_iou, whole_pixels
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
@@ -335,9 +336,15 @@ def open_finder(
     """Open annotation files if there are any; else track fish, as also for boxes without ids.
 
     `pictures`: the source of the frames, whose names masks and boxes may refer to.
-    Raises AnnotationError or ModelError if a file cannot be read.
+    Raises AnnotationError or ModelError if a file cannot be read, and ConfigError for motion in
+    pictures of which none follows another.
     """
     if boxes is None and masks is None:
+        if detect.detector == "motion" and not track.across_frames:
+            raise ConfigError(
+                "[track_fish] across_frames = false: expected a detector for single pictures, got "
+                '[detect_fish] detector = "motion"; set it to "looks", or give --stills instead'
+            )
         return TrackedFish(open_detector(detect), track)
     if boxes is not None and names_pictures(boxes):
         folder = None if masks is None else MaskFolder(masks, pictures=pictures)

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from stream_dmr.detection.given_fish import AnnotatedFish
 from stream_dmr.detection.open_detector import DetectFishSettings
+from stream_dmr.errors import ConfigError
 from stream_dmr.messages import Frame
 from stream_dmr.tracking.finder import TrackedFish, TrackFishSettings, open_finder
 
@@ -41,3 +43,9 @@ def test_boxes_of_stills_with_equal_ids_are_said(tmp_path):
         followed.detect(Frame(frame_index=f, timestamp_ns=f, image=image, source=""))
     (said,) = followed.warnings
     assert "id 7 in 2 pictures; where" in said
+
+
+def test_motion_is_refused_where_no_picture_follows_another():
+    track = TrackFishSettings(across_frames=False)
+    with pytest.raises(ConfigError, match=r'set it to "looks"'):
+        open_finder(boxes=None, masks=None, detect=DetectFishSettings(), track=track)
