@@ -29,8 +29,9 @@ _EDGE_PX = 3  # from a tile's edge: a box so near may be cut
 _SURE_NEAR = 0.45  # least score in a tile, where parts of other things look like fish
 _SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
 # Share of the longest fish in the picture: shorter finds are dirt, scales or leaves beside it, and
-# only their size shows it. See docs/research/real-lengths.md.
-_SHORTEST = 0.1
+# only their size shows it. See docs/research/real-lengths.md. And least share of the picture's longer
+# side: of shorter ones lamps and handles are as sure. See docs/research/real-pictures.md.
+_SHORTEST, _LEAST = 0.1, 0.05
 
 
 def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
@@ -138,10 +139,11 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     for candidate in sorted([*whole, *others], key=lambda candidate: -candidate.score):
         if not any(_are_same(candidate, fish) for fish in kept):
             kept.append(candidate)
+    least_px = _LEAST * max(height, width)
     kept = [
         replace(fish, score=(fish.score + 2 * look_closer(detector, frame, fish.bbox_xyxy_px)) / 3)
         for fish in kept
-        if fish.score >= _FAINT
+        if fish.score >= _FAINT and longer_side(fish.bbox_xyxy_px) >= least_px
     ]
     sure = [longer_side(fish.bbox_xyxy_px) for fish in kept if fish.score >= _SURE_NEAR]
     longest_px = max(sure, default=0.0)
