@@ -66,6 +66,11 @@ def explain_no_fish(
     shapes = ", ".join(f"{count} {reason}" for reason, count in commonest)
     if 0 < seen.candidates < sum(refused.values()):  # what most often moved may be the fish
         begin += f"most of what moved was refused ({shapes}), change that where it was fish; else "
+    if seen.candidates == 0 and not settings.across_frames:
+        return begin + (
+            "nothing looked like a fish that is a twentieth of the picture long or more; go nearer, "
+            "or give --boxes"
+        )
     if seen.candidates == 0 and not refused:
         return begin + (
             "nothing moved or looked like a fish; fish that hardly move and look unlike others "

@@ -34,6 +34,11 @@ def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
     assert "\n" not in line
 
 
+def test_the_line_says_how_large_a_fish_of_a_still_must_be():
+    stills = TrackFishSettings(across_frames=False)
+    assert "a twentieth of the picture" in explain_no_fish(Sightings(frames=9), {}, stills)
+
+
 SHORT = "shorter than [detect_fish] motion_min_length"
 
 
