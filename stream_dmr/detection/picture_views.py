@@ -29,8 +29,8 @@ _EDGE_PX = 3  # from a tile's edge: a box so near may be cut
 _SURE_NEAR = 0.45  # least score in a tile, where parts of other things look like fish
 _SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
 # Share of the longest fish in the picture: shorter finds are dirt, scales or leaves beside it, and
-# only their size shows it. See docs/research/real-lengths.md. And least share of the picture's longer
-# side: of shorter ones lamps and handles are as sure. See docs/research/real-pictures.md.
+# only their size shows it. See docs/research/real-lengths.md. And least share of the picture's
+# longer side: of shorter finds lamps and handles are as sure; see docs/research/real-pictures.md.
 _SHORTEST, _LEAST = 0.1, 0.05
 
 

@@ -68,8 +68,8 @@ def explain_no_fish(
         begin += f"most of what moved was refused ({shapes}), change that where it was fish; else "
     if seen.candidates == 0 and not settings.across_frames:
         return begin + (
-            "nothing looked like a fish that is a twentieth of the picture long or more; go nearer, "
-            "or give --boxes"
+            "nothing looked like a fish that is a twentieth of the picture long or more; go "
+            "nearer, or give --boxes"
         )
     if seen.candidates == 0 and not refused:
         return begin + (
