@@ -72,7 +72,7 @@ def fish_outline(
     # The left and the right end of its principal axis.
     pixels = np.argwhere(blob)[:, ::-1].astype(np.float64)
     center = pixels.mean(axis=0)
-    _, vectors = np.linalg.eigh(np.cov((pixels - center).T))
+    _, vectors = np.linalg.eigh(np.cov((pixels - center).T, bias=True))
     axis = vectors[:, 1] * (1.0 if vectors[0, 1] >= 0 else -1.0)
     along = (pixels - center) @ axis
     left, right = center + along.min() * axis, center + along.max() * axis

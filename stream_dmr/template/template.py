@@ -13,6 +13,7 @@ from stream_dmr.errors import TemplateError
 from stream_dmr.geometry import arc_lengths
 
 NUM_MIDLINE_POINTS = 33
+NEAR_CENTER = 0.1  # body lengths, within which the section at the center is measured
 _MAX_OUTSIDE = 0.02  # chosen: how far a keypoint or joint may lie outside the mesh, in body lengths
 
 
@@ -59,8 +60,8 @@ def canonical_template(
     """The template of a closed mesh in any unit, place and orientation.
 
     `points` holds `keypoints` (head, center, tail) and `joints` (J, 3; J >= 2, in any order) in the
-    mesh's coordinates. Raises TemplateError if a point lies off the mesh, or if head and tail, or
-    joints, coincide.
+    mesh's coordinates. Raises TemplateError if a point lies off the mesh, if head and tail, or
+    joints, coincide, or if the mesh has no vertices around the center.
     """
     keypoints, joints = points["keypoints"], points["joints"]
     head, _, tail = keypoints
@@ -82,9 +83,15 @@ def canonical_template(
     at = arc_lengths(spine)
     even = np.linspace(0.0, at[-1], NUM_MIDLINE_POINTS)
     midline = [np.interp(even, at, coordinates) for coordinates in spine.T]
+    vertices = to_canonical(np.asarray(mesh.vertices, np.float64))
+    if not (np.abs(vertices[:, 0]) < NEAR_CENTER).any():
+        raise TemplateError(
+            f"template {name}: expected vertices all along the body, got none within "
+            f"{NEAR_CENTER:g} body lengths of its center; subdivide the mesh"
+        )
     return Template(
         name=name,
-        rest_vertices=to_canonical(np.asarray(mesh.vertices, np.float64)),
+        rest_vertices=vertices,
         faces=np.asarray(mesh.faces, np.int64),
         keypoints=to_canonical(keypoints),
         joints=to_canonical(joints),

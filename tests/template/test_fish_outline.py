@@ -116,12 +116,13 @@ def test_an_outline_that_is_alike_from_both_ends_is_no_fish(breadth: float, turn
         (np.zeros((50, 50), bool), "expected a fish in the mask, got an empty mask"),
         (np.pad(np.ones((300, 300), bool), 9), "expected a fish longer than broad"),
         (np.pad(np.ones((10, 60), bool), 9), "expected a fish of at least 100 px"),
+        (np.pad(np.ones((1, 1), bool), 9), "expected a fish of at least 100 px, got 0 px"),
         (side_view("cod")[0][:, 200:], "got one cut off by the picture's rim"),
         (side_view("cod")[0] | np.roll(side_view("cod")[0], 300, axis=0), "got 2 parts"),
         (banana(), "expected a straight fish"),
         (ellipse(0.22), "an outline without a tail fin whose ends are alike"),
     ],
-    ids=["empty", "square", "small", "cut off", "two", "bent", "ellipse"],
+    ids=["empty", "square", "small", "one pixel", "cut off", "two", "bent", "ellipse"],
 )
 def test_what_is_no_straight_fish_is_refused_in_one_line(mask: np.ndarray, message: str):
     with pytest.raises(TemplateError, match=f"side.png: .*{message}") as refusal:

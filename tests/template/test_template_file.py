@@ -115,6 +115,7 @@ class TestRefusals:
         [
             (with_nan, "expected finite vertices, got NaN"),
             (lambda: trimesh.Trimesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "empty"),
+            (lambda: trimesh.creation.box(fish_mesh().extents), "got none within 0.1 body lengths"),
         ],
     )
     def test_mesh(self, tmp_path, mesh, match):

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from stream_dmr.fitting.body import Body, bind_to_midline
 from stream_dmr.geometry import arc_lengths
-from stream_dmr.template.template import Template
+from stream_dmr.template.template import NEAR_CENTER, Template
 
 # Places along the midline, 0 at the snout and 1 at the tail keypoint: the places of the tables in
 # template/body_forms.toml, at which a body form can become any other form exactly.
@@ -38,7 +38,6 @@ LOBES = THICKNESS.stop
 NUM_COEFFICIENTS = LOBES + 1
 _TAIL_FROM = 0.9  # the beginning of the tail's fin
 
-_NEAR_CENTER = 0.1  # body lengths: some rings of any template
 
 # The mean log breadth of the trunk, between head and peduncle, as a row over the coefficients.
 TRUNK = np.zeros(NUM_COEFFICIENTS)
@@ -95,7 +94,7 @@ def reshaped(template: Template, coefficients: Float[np.ndarray, "W"]) -> Templa
 
 def half_section(template: Template) -> Float[np.ndarray, "2"]:
     """Half the breadth and half the thickness (body lengths) around the center keypoint."""
-    near = np.abs(template.rest_vertices[:, 0] - template.keypoints[1, 0]) < _NEAR_CENTER
+    near = np.abs(template.rest_vertices[:, 0] - template.keypoints[1, 0]) < NEAR_CENTER
     return np.abs(template.rest_vertices[near, 1:] - template.keypoints[1, 1:]).max(axis=0)
 
 
