@@ -83,11 +83,15 @@ def box_from_xywh(
     return np.array([x, y, x + width, y + height])
 
 
+_MAX_ID = 2**53  # above it numbers read as floats are no longer exact
+
+
 def group_by_frame(boxes: Iterable[tuple[str, int, AnnotatedBox]]) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame (from 1), within a frame by id.
 
     Each box comes with its place in the file, for messages, and its frame. Raises AnnotationError
-    where a fish has two boxes in a frame, or only some boxes have ids.
+    where a fish has two boxes in a frame, only some boxes have ids, or an id is too large to be
+    kept exactly.
     """
     frames: dict[int, list[AnnotatedBox]] = {}
     seen: set[tuple[int, int]] = set()
@@ -99,6 +103,8 @@ def group_by_frame(boxes: Iterable[tuple[str, int, AnnotatedBox]]) -> dict[int, 
                 f"{where}: expected ids for all boxes or for none; complete them or leave them out"
             )
         has_ids = has_id
+        if box.track_id > _MAX_ID:
+            raise AnnotationError(f"{where}: expected an id up to {_MAX_ID}, got {box.track_id}")
         if has_id and (frame_index, box.track_id) in seen:
             raise AnnotationError(
                 f"{where}: expected one box per fish and frame, "

@@ -85,6 +85,7 @@ def test_other_formats_are_refused_by_line(tmp_path, text):
         ("1,-2,10,10,20,20,0.9,-1,-1,-1", "or -1 in every line for detections, got -2"),
         ("1,0,10,10,20,20,1,1,1", "an id of 1 or more"),
         ("1,1.5,10,10,20,20,1,1,1", "got 1.5"),
+        (f"1,{2**63},10,10,20,20,1,1,1", "an id up to 9007199254740992"),
         ("0,1,10,10,20,20,1,1,1", "frame number, counted from 1, got 0"),
         ("1.5,1,10,10,20,20,1,1,1", "frame number, counted from 1, got 1.5"),
         ("1,1,10,10,20,20,1,1,1.2", "visibility from 0 to 1, got 1.2"),
