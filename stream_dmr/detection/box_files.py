@@ -83,7 +83,7 @@ def box_from_xywh(
     return np.array([x, y, x + width, y + height])
 
 
-_MAX_ID = 2**53  # above it numbers read as floats are no longer exact
+_MAX_ID = 2**53 - 1  # the last that no other number is rounded to when read as a float
 
 
 def group_by_frame(boxes: Iterable[tuple[str, int, AnnotatedBox]]) -> dict[int, list[AnnotatedBox]]:

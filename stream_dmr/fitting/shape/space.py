@@ -38,7 +38,6 @@ LOBES = THICKNESS.stop
 NUM_COEFFICIENTS = LOBES + 1
 _TAIL_FROM = 0.9  # the beginning of the tail's fin
 
-
 # The mean log breadth of the trunk, between head and peduncle, as a row over the coefficients.
 TRUNK = np.zeros(NUM_COEFFICIENTS)
 TRUNK[2:8] = TRUNK[_NUM_SIDE + 2 : _NUM_SIDE + 8] = 1 / 12
