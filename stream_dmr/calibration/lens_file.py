@@ -32,6 +32,9 @@ _IS_FISHEYE = {
     **dict.fromkeys(("pinhole", "radtan", "plumb_bob", "rational_polynomial", "none"), False),
 }
 _SIDES = {"left": "L", "right": "R"}
+# Focal lengths over the picture's longer side: a fisheye of 220 degrees has 0.26, a telephoto lens
+# of 1,000 mm on 35 mm film 28. Millimetres in the place of pixels are below.
+_LEAST_FOCAL, _LARGEST_FOCAL = 0.1, 50.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -89,6 +92,7 @@ def lens_of(values: Values, path: Path) -> LensFile:
     if "image_width" in values or "image_height" in values:
         width = _positive_int(values, "image_width", path)
         size = (width, _positive_int(values, "image_height", path))
+        _check_focal_lengths(K, size, path)
     return LensFile(K=K, distortion=distortion, is_fisheye=is_fisheye, size=size)
 
 
@@ -212,4 +216,14 @@ def _check_intrinsics(K: Float[np.ndarray, "3 3"], path: Path) -> None:
         raise CalibrationError(
             f"{path}: camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "
             f"got {K.tolist()}; {CALIBRATE}"
+        )
+
+
+def _check_focal_lengths(K: Float[np.ndarray, "3 3"], size: tuple[int, int], path: Path) -> None:
+    least, largest = _LEAST_FOCAL * max(size), _LARGEST_FOCAL * max(size)
+    if not (least <= K[0, 0] <= largest and least <= K[1, 1] <= largest):
+        raise CalibrationError(
+            f"{path}: camera_matrix: expected focal lengths in pixels, {least:.0f} to "
+            f"{largest:.0f} for pictures of {size[0]}x{size[1]}, got {K[0, 0]:g} and {K[1, 1]:g}; "
+            f"check that they are not in mm, or {CALIBRATE}"
         )

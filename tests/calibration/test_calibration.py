@@ -84,6 +84,8 @@ def test_columns_rows_and_integers_are_all_vectors(tmp_path):
         ({"camera_matrix": GOOD["camera_matrix"].reshape(1, 9)}, "camera_matrix"),
         ({"camera_matrix": GOOD["camera_matrix"].T.copy()}, "camera_matrix"),
         ({"camera_matrix": GOOD["camera_matrix"] * [[-1], [1], [1]]}, "positive focal lengths"),
+        ({"camera_matrix": np.diag([4.2, 4.2, 1.0])}, "not in mm"),
+        ({"camera_matrix": np.diag([1e7, 1e7, 1.0])}, "64 to 32000"),  # 640 x 480
         ({"camera_matrix": GOOD["camera_matrix"] * np.nan}, "camera_matrix: expected finite"),
         ({"distortion_coefficients": np.zeros((1, 3))}, "distortion_coefficients"),
         ({"distortion_coefficients": np.full((1, 5), np.inf)}, "distortion_coefficients"),
