@@ -1,4 +1,4 @@
-"""The Kalman filter of a constant length, with a robust start and a gate on the innovation.
+"""The Kalman filter of a constant length, with a robust start and a gate around that start.
 
 x = [length_mm], F = H = 1, Q the square of a small drift, R from the std of each frame's fit.
 """
@@ -185,20 +185,23 @@ class ConstantLengthFilter:
         return self._correlation.design_effect
 
     def offer(self, measurement: Measurement) -> bool:
-        """Use one more frame, in the order of frames, unless its innovation is too large."""
+        """Use one more frame, in the order of frames, unless it contradicts most of the others.
+
+        The gate is around the robust start, not around the frames used so far: a few wrong frames
+        at the beginning, as of a track that began on another fish, would shut out all the others.
+        """
         z = np.array([measurement.length_mm])
         R = _ONE * self._start.measurement_variance(measurement)
+        # y^2 / S is chi-square with one degree of freedom
+        y, S = z[0] - self._start.length_mm, R[0, 0] + self._start.variance
+        if y**2 > self._gate * S:
+            return False
         if self.frames:
             Q = self._process_variance * (measurement.frame_index - self.frames[-1])
             x, P = predict(self._x[-1], self._P[-1], Q=Q)  # pyright: ignore[reportArgumentType]
-        else:
-            x, P = np.array([self._start.length_mm]), _ONE * self._start.variance
-        # y = z - Hx, S = HPH' + R; y^2 / S is chi-square with one degree of freedom
-        y, S = (z - x)[0], (P + R)[0, 0]
-        if y**2 > self._gate * S:
-            return False
-        # The start serves the gate only: the first frame used is the whole state (no prior).
-        x, P = update(x, P, z, R, _ONE)[:2] if self.frames else (z, R)
+            x, P = update(x, P, z, R, _ONE)[:2]
+        else:  # the start serves the gate only: the first frame used is the whole state (no prior)
+            x, P = z, R
         self.frames.append(measurement.frame_index)
         self._correlation.add(measurement.timestamp_ns)
         self._x.append(x)

@@ -1,6 +1,6 @@
 """One length per fish from its frames: a running estimate, and a final one with its interval.
 
-Frames are weighted by the variance of their fit and gated by their innovation
+Frames are weighted by the variance of their fit and gated by their distance from most others
 (`kalman.py`). The interval also holds the error that all frames of a fish share, which no
 averaging removes. Frames of one track are not independent measurements.
 """

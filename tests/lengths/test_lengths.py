@@ -151,6 +151,20 @@ def test_a_bad_start_is_overruled_as_soon_as_the_good_frames_are_more():
     assert dict(estimates[-1].refused) == {Reason.OUTLIER: 2}
 
 
+@given(seeds)
+def test_which_frames_are_outliers_does_not_depend_on_their_order(seed):
+    """Most frames decide, so that a track that begins on another fish ends as its own."""
+    rng = np.random.default_rng(seed)
+    lengths_mm = np.concatenate([rng.normal(700, 60, 9), rng.uniform(200, 1500, 5)])
+    order = rng.permutation(len(lengths_mm))
+
+    def used(lengths_mm):
+        frames = [frame(i, z, std_mm=0.03 * z) for i, z in enumerate(lengths_mm)]
+        return set(lengths_mm[run(frames)[-1].smoothed_frames])
+
+    assert used(lengths_mm) == used(lengths_mm[order])
+
+
 def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
     frames = [frame(i, 700.0 + i % 3) for i in range(1, 9)]
     frames[6] = frame(7, 400.0)
