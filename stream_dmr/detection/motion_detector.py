@@ -235,6 +235,7 @@ class MotionDetector:
         self._before: UInt8[np.ndarray, "h w 3"] | None = None  # last picture, background's pixels
         self._is_foreign: Bool[np.ndarray, "h w"] | None = None  # in the last picture's pixels
         self._background_from_picture: Affine = _IDENTITY
+        self._shift_px = np.zeros(2)  # of the background, all together
         self._refused: Counter[str] = Counter()
 
     @property
@@ -260,7 +261,7 @@ class MotionDetector:
     ) -> Float[np.ndarray, "2"]:
         """A point of the last frame, of shape (H, W), without the camera's motion; px."""
         scale = min(1.0, self._settings.motion_working_px / max(shape))
-        return self._background_from_picture @ [*(point * scale), 1.0] / scale
+        return (self._background_from_picture @ [*(point * scale), 1.0] - self._shift_px) / scale
 
     def _find_moving(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """The mask of pixels that differ from the background and move; learns the background."""
@@ -310,6 +311,7 @@ class MotionDetector:
         center = np.array([grey.shape[1] / 2, grey.shape[0] / 2])
         x, y = np.round(center - place @ [*center, 1.0]).astype(int).tolist()
         background.shift(x, y)
+        self._shift_px += (x, y)
         shift = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
         self._before = warp(before, shift)
         place = compose(shift, place)

@@ -26,6 +26,7 @@ _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
 # Share of a track's frames whose mask is surer by so much than one in which it is clear. A lamp or
 # a leaf that is seen for hours is clear in four frames, a weed that sways in one of three or four.
 # Of 63 real fish all but one were so sure in a quarter of them; see docs/research/tracking.md.
+# A fish that comes into view slowly is unsure while the picture cuts it: these frames don't count.
 _MIN_SURE_SHARE, _SURER = 0.25, 0.08
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -68,7 +69,7 @@ class FishConfirmation:
     def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
         self._confirmed: set[int] = set()  # track numbers
-        self._num_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._num_frames: Counter[int] = Counter()  # of unconfirmed tracks, whole or surely seen
         self._num_clear_frames: Counter[int] = Counter()  # likewise
         self._num_sure_frames: Counter[int] = Counter()  # likewise
         self._clear_crops: dict[int, deque[FishCrop]] = {}  # likewise, the latest
@@ -87,15 +88,15 @@ class FishConfirmation:
         confidence = crop.quality.mask_confidence
         earlier: list[FishCrop] = []
         if number not in self._confirmed:
-            self._num_frames[number] += 1
             clear = self._settings.min_mask_confidence
-            if confidence is None or confidence >= clear + _SURER:
-                self._num_sure_frames[number] += 1
+            is_sure = confidence is None or bool(confidence >= clear + _SURER)
+            self._num_sure_frames[number] += is_sure
+            self._num_frames[number] += is_sure or not crop.quality.touches_border
             if confidence is None or confidence >= clear:
                 self._num_clear_frames[number] += 1
                 kept = self._clear_crops.setdefault(number, deque(maxlen=_MAX_KEPT_CROPS))
                 kept.append(crop)
-            if not (may_count and self._is_confirmed_by(number, crop)):
+            if not (may_count and self._is_in_zone(crop) and self.is_cut_out(number)):
                 return []
             self._confirmed.add(number)
             earlier = [old for old in self._forget(number) if old is not crop]
@@ -116,18 +117,21 @@ class FishConfirmation:
         del self._num_sure_frames[number]
         return self._clear_crops.pop(number, ())
 
-    def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
+    def is_cut_out(self, number: int) -> bool:
+        """True if the masks of a track are such as to confirm it."""
+        num_clear = self._num_clear_frames[number]  # 1 in a still, which shows a fish once
+        needed = max(_MIN_SURE_SHARE * self._num_frames[number], 1)
+        is_sure = num_clear == 1 or self._num_sure_frames[number] >= needed
+        return num_clear >= self._settings.min_track_frames and is_sure
+
+    def _is_in_zone(self, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
         left, top, right, bottom = self._settings.zone
-        is_in_zone = (
+        return (
             left * width <= (x0 + x1) / 2 <= right * width
             and top * height <= (y0 + y1) / 2 <= bottom * height
         )
-        num_frames = self._num_frames[number]  # 1 in a still, which shows a fish once
-        is_sure = num_frames == 1 or self._num_sure_frames[number] >= _MIN_SURE_SHARE * num_frames
-        is_clear = self._num_clear_frames[number] >= self._settings.min_track_frames
-        return is_in_zone and is_clear and is_sure
 
 
 # Of how much it looks like a fish: in a picture of the whole frame, where other things do as well,
@@ -141,6 +145,9 @@ _MIN_SURE_LOOKS, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
 # alone, since the network for masks loses a thin fish in a wider box.
 _MIN_MOTION = 0.25
 _FAR = 0.5
+# Share of how far the camera has moved: what is nearer or farther than the scene at large drifts by
+# so much in it. Rocks that a camera passes by had moved by up to six times their size.
+_PARALLAX = 0.5
 
 
 class FishEvidence:
@@ -149,6 +156,7 @@ class FishEvidence:
     def __init__(self, candidate: Candidate, size_px: float) -> None:
         """`size_px`: the longer side of the candidate."""
         self._first_edges_px = _edges_px(candidate)
+        self._first_offset_px = _camera_offset_px(candidate)
         self._need_not_move = candidate.place_px is None  # somebody found it
         self._motion = 0.0
         self._judged_frames = self._sure_frames = 0
@@ -160,7 +168,9 @@ class FishEvidence:
         if edges_px is not None and self._first_edges_px is not None:
             is_outlined = candidate.foreground is not None
             distance_px = _distance(self._first_edges_px, edges_px, is_outlined=is_outlined)
-            self._motion = max(self._motion, distance_px / size_px)
+            travel_px = np.hypot(*(_camera_offset_px(candidate) - self._first_offset_px))
+            own_px = distance_px - _PARALLAX * float(travel_px)
+            self._motion = max(self._motion, own_px / size_px)
         if candidate.looks is not None:
             self._judged_frames += 1
             self._sure_frames += candidate.looks >= _SURE
@@ -211,6 +221,12 @@ def _edges_px(candidate: Candidate) -> Float[np.ndarray, "2 2"] | None:
         return None
     half = (candidate.bbox_xyxy_px[2:] - candidate.bbox_xyxy_px[:2]) / 2
     return np.stack([candidate.place_px - half, candidate.place_px + half])
+
+
+def _camera_offset_px(candidate: Candidate) -> Float[np.ndarray, "2"]:
+    """From where it is seen to where it is in the scene: this changes as the camera moves."""
+    middle = (candidate.bbox_xyxy_px[:2] + candidate.bbox_xyxy_px[2:]) / 2
+    return np.zeros(2) if candidate.place_px is None else candidate.place_px - middle
 
 
 def _distance(

@@ -46,6 +46,7 @@ class Sightings:
     tracks: int = 0
     any_moved: bool = False  # a track moved from its place
     any_fish_like: bool = False  # a track that moved looked like a fish
+    any_cut_out: bool = False  # a track had sure masks, but did not move or look like a fish
     best_score: float = 0.0  # of any candidate
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
 
@@ -104,10 +105,15 @@ def explain_no_fish(
             f"min_mask_confidence = {settings.min_mask_confidence:g} (the surest "
             f"{seen.best_confidence:.2f}); lower it, or train the network on these pictures"
         )
+    if seen.any_cut_out:
+        return begin + (
+            f"{seen.tracks} shapes were followed; those with sure masks did not look like a fish "
+            "to the network; set [track_fish] min_fish_like_frames = 0 where they are fish"
+        )
     return begin + (
-        f"{seen.tracks} shapes were followed, none with a sure mask in "
-        f"{settings.min_track_frames} frames and a quarter of all within the zone; lower "
-        "[track_fish] min_track_frames, or widen zone; --stills for single pictures"
+        f"{seen.tracks} shapes were followed, none had a sure mask in a quarter of its frames and "
+        f"in {settings.min_track_frames} within the zone; lower [track_fish] min_mask_confidence "
+        "or min_track_frames, or widen zone; --stills for single pictures"
     )
 
 
@@ -249,6 +255,7 @@ class TrackedFish:
             single = without_repeats({track: crops[track] for track in fish}, self._scores)
             fish = {track: fish[track] for track in single}
         self._found_any |= bool(fish)
+        self._seen.any_cut_out |= any(map(self._confirmation.is_cut_out, crops))
         self._seen.tracks = max([self._seen.tracks, *crops])
         confidences = [crop.quality.mask_confidence or 0.0 for crop in crops.values()]
         self._seen.best_confidence = max([self._seen.best_confidence, *confidences])

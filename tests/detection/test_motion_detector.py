@@ -49,6 +49,16 @@ def test_a_swimming_fish_is_found_whether_the_camera_rests_or_pans(step: tuple[f
     assert sum(map(len, found[6:])) <= 20  # and little else
 
 
+@pytest.mark.parametrize("step", [(0.0, 0.0), (2.0, 1.0), (-3.5, 0.7)])
+def test_a_place_of_the_scene_stays_the_same_while_the_camera_pans(step: tuple[float, float]):
+    detector, places = MotionDetector(MotionSettings()), []
+    for i, wall in enumerate(pan(5, step, 24)):
+        detector.find(frame_of(wall, i + 1))
+        seen = np.array([150.0, 120.0]) - np.multiply(i, step)
+        places.append(detector.scene_point(seen, shape=wall.shape))
+    np.testing.assert_allclose(places[6:], np.broadcast_to(places[6], (18, 2)), atol=1.0)
+
+
 def test_what_stands_still_is_no_fish():
     wall = texture(2)[:240, :320]
     stained = draw_fish(wall, 160, 120)

@@ -35,6 +35,13 @@ def test_a_track_is_confirmed_after_enough_clear_frames():
     assert confirmed(crops, min_track_frames=3) == [False] * 5 + [True] * 2
 
 
+def test_frames_in_which_the_picture_cuts_a_fish_do_not_speak_against_it():
+    unsure, sure = crop_at(50, 50, confidence=0.1), crop_at(50, 50)
+    cut = replace(unsure, quality=replace(unsure.quality, touches_border=True))
+    assert confirmed([*[cut] * 20, sure, sure], min_track_frames=2)[-2:] == [False, True]
+    assert confirmed([*[unsure] * 20, sure, sure], min_track_frames=2)[-2:] == [False, False]
+
+
 def test_a_given_mask_is_clear():
     assert confirmed([crop_at(50, 50, confidence=None)] * 2, min_track_frames=2) == [False, True]
 

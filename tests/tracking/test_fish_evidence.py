@@ -11,9 +11,13 @@ from stream_dmr.tracking.confirmation import FishEvidence
 SIZE_PX = 60.0
 
 
-def candidate(x: float | None = 0.0, *, looks: float | None = None) -> Candidate:
-    box = np.array([10.0, 20.0, 70.0, 40.0])
+def candidate(
+    x: float | None = 0.0, *, looks: float | None = None, camera_x: float = 0.0
+) -> Candidate:
+    """At x in the scene, before a camera that has moved by `camera_x`."""
     place = None if x is None else np.array([x, 150.0])
+    left, top = (x or 0.0) - camera_x - SIZE_PX / 2, 140.0
+    box = np.array([left, top, left + SIZE_PX, top + 20.0])
     return Candidate(bbox_xyxy_px=box, score=1.0, place_px=place, looks=looks)
 
 
@@ -37,6 +41,20 @@ def evidence_of(*candidates: Candidate) -> FishEvidence:
 def test_it_is_the_greatest_distance_from_the_first_place_that_counts(place, has_moved, went_far):
     evidence = evidence_of(*(candidate(place(i)) for i in range(12)))
     assert (evidence.has_moved, evidence.went_far) == (has_moved, went_far)
+
+
+@pytest.mark.parametrize(
+    ("speed", "has_moved"),
+    [
+        (0.0, False),  # a rock at the depth of the scene
+        (4.0, False),  # a rock before it, or behind it
+        (10.0, True),  # a fish that the camera follows
+        (-10.0, True),
+    ],
+)
+def test_what_a_panning_camera_passes_has_not_moved(speed, has_moved):
+    frames = [candidate(200 + speed * i, camera_x=10.0 * i) for i in range(30)]
+    assert evidence_of(*frames).has_moved == has_moved
 
 
 def test_a_network_s_box_that_jumps_has_not_moved():

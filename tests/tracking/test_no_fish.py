@@ -13,6 +13,7 @@ LIMITS = TrackFishSettings(min_mask_confidence=0.8)
 
 
 LOOKED_AT = Sightings(frames=9, candidates=5, best_score=0.9, best_confidence=0.9)
+CUT_OUT = replace(LOOKED_AT, tracks=2, any_moved=True, any_fish_like=True, any_cut_out=True)
 
 
 @pytest.mark.parametrize(
@@ -24,7 +25,8 @@ LOOKED_AT = Sightings(frames=9, candidates=5, best_score=0.9, best_confidence=0.
         (replace(LOOKED_AT, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
         (replace(LOOKED_AT, tracks=2), {}, "none left its place"),
         (replace(LOOKED_AT, tracks=2, any_moved=True), {}, "min_fish_like_frames = 0"),
-        (replace(LOOKED_AT, tracks=2, any_moved=True, any_fish_like=True), {}, "min_track_frames"),
+        (CUT_OUT, {}, "did not look like a fish"),
+        (replace(CUT_OUT, any_cut_out=False), {}, "min_track_frames"),
     ],
 )
 def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
