@@ -1,4 +1,4 @@
-"""Compute lengths again with another setting: examples/03_... [RUN [OUT]]
+"""Lengths with another setting: python examples/03_replay_with_another_setting.py [RUN [OUT]]
 
 RUN is the folder of a run, such as that of example 01. A replay starts at the stage that the
 setting belongs to and takes all that came before from the recording, so the video is not needed.

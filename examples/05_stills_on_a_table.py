@@ -35,6 +35,6 @@ run = sd.measure(
 names = [path.name for path in sorted(pictures.iterdir())]
 for fish in run.fish:
     length = fish.status if fish.length_mm is None else f"{fish.length_mm:.0f} mm"
-    if fish.length_std_mm is not None:
-        length += f" +- {1.96 * fish.length_std_mm:.0f} mm"  # one picture leaves the slant open
+    if fish.length_mm is not None:  # one picture leaves the slant open: the interval is wide
+        length += f", 95 % interval {fish.ci95_low_mm:.0f} to {fish.ci95_high_mm:.0f} mm"
     print(f"{names[fish.first_frame - 1]}: {length}")

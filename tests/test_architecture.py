@@ -33,9 +33,9 @@ GROUND_FLOOR = [
         *("geometry", "settings", "errors", "version"),
     )
 ]
-# From the top down, as in the design: a module belongs to the room with the longest name that it
-# begins with, and imports from its own room and those below.
-ROOMS = [
+# From the top down, as in the design: a module belongs to the package with the longest name that it
+# begins with, and imports from its own package and those below.
+PACKAGES = [
     "stream_dmr",  # the names that `import stream_dmr` offers
     "stream_dmr.cli",
     "stream_dmr.api",
@@ -77,7 +77,9 @@ WHO_KNOWS = {
     "filterpy": ["stream_dmr.lengths", "stream_dmr.tracking"],
     "onnxruntime": ["stream_dmr.networks"],
     "ray": ["stream_dmr.batch"],
-    "stream_dmr.nodes": [f"stream_dmr.{room}" for room in ("pipeline", "batch", "web", "nodes")],
+    "stream_dmr.nodes": [
+        f"stream_dmr.{package}" for package in ("pipeline", "batch", "web", "nodes")
+    ],
     "pynmeagps": ["stream_dmr.sources"],
     "serial": ["stream_dmr.sources"],
     "typer": ["stream_dmr.cli"],
@@ -108,24 +110,24 @@ def _imports(path: Path, *, top_only: bool) -> Iterator[str]:
             yield from names & MODULES or {str(node.module)}
 
 
-def is_inside(module: str, rooms: list[str]) -> bool:
-    return any(module == room or module.startswith(f"{room}.") for room in rooms)
+def is_inside(module: str, packages: list[str]) -> bool:
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
-def room_of(module: str) -> str:
-    rooms = [room for room in ROOMS if is_inside(module, [room])]
-    room = max(rooms, key=len)
-    assert room == module or room != "stream_dmr", f"{module} belongs to no room"
-    return room
+def package_of(module: str) -> str:
+    packages = [package for package in PACKAGES if is_inside(module, [package])]
+    package = max(packages, key=len)
+    assert package == module or package != "stream_dmr", f"{module} belongs to no package"
+    return package
 
 
-def test_every_module_belongs_to_a_room():
-    with_modules = {room_of(module) for module in MODULES}
-    assert with_modules == set(ROOMS)
+def test_every_module_belongs_to_a_package():
+    with_modules = {package_of(module) for module in MODULES}
+    assert with_modules == set(PACKAGES)
 
 
 @pytest.mark.parametrize("library", WHO_KNOWS)
-def test_only_its_rooms_know_a_library(library: str):
+def test_only_its_packages_know_a_library(library: str):
     strangers = {
         module_of(path)
         for path in FILES
@@ -141,7 +143,7 @@ def test_imports_point_downwards():
         for path in FILES
         for name in imports(path)
         if is_inside(name, ["stream_dmr"])
-        and ROOMS.index(room_of(name)) < ROOMS.index(room_of(module_of(path)))
+        and PACKAGES.index(package_of(name)) < PACKAGES.index(package_of(module_of(path)))
     ]
     assert not upwards
 

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    plane: Annotated[Path, "Photograph of the board lying in the reference plane, or of --ends."],
+    plane: Annotated[
+        Path, "Photograph of the board in the reference plane; with --ends, of a ruler."
+    ],
     images: Annotated[
         list[Path] | None,
         typer.Argument(help="Photographs of the board, tilted to all sides; none with --lens."),
@@ -54,7 +56,7 @@ def calibrate(
     ends: Annotated[
         str | None,
         typer.Option(
-            help="Without a board: ends of a ruler in --plane, px, which was taken squarely.",
+            help="Without a board: both ends of a ruler in --plane, px, seen squarely.",
             metavar="U,V,U,V",
         ),
     ] = None,

@@ -56,7 +56,7 @@ def combine(
         Path, typer.Argument(help="Folder or recording of one camera's run.", metavar="LEFT")
     ],
     second: Annotated[
-        Path, typer.Argument(help="That of the other camera, of the same fish.", metavar="RIGHT")
+        Path, typer.Argument(help="Folder or recording of the other camera's run.", metavar="RIGHT")
     ],
     out: Annotated[Path, "Folder for the recording and tables of both."],
     overwrite: Annotated[bool, "Replace the results of an earlier run in --out."] = False,

@@ -23,9 +23,12 @@ def review(
     source: PicturesOption = None,
     config: FisheriesOption = None,
     sample: Annotated[
-        int | None, typer.Option(help="Review so many fish, drawn at random, for an audit.", min=1)
+        int | None,
+        typer.Option(help="Review this many fish, drawn at random, for an audit.", min=1),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of --sample; equal seeds draw equal fish.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of --sample; the same seed draws the same fish.", min=0)
+    ] = 0,
     blind: Annotated[
         bool, "A second reading: earlier verdicts are hidden, and yours are only compared."
     ] = False,
@@ -65,7 +68,7 @@ def import_(
     reviewer: Annotated[str, "Your name, for the verdicts.", "who is logged in"] = "",
     source: Annotated[
         str | None,
-        "The recorded clip, for fish that were drawn.",
+        "The video or folder that was measured, for fish that were drawn.",
         "the one that was measured, if it is still there",
     ] = None,
 ) -> None:
@@ -87,7 +90,7 @@ def import_(
 
 
 def agreement(folders: _Folders) -> None:
-    """Say how well the review and blind readings agree: decisions, species, lengths."""
+    """Report how well the review and blind readings agree: decisions, species, lengths."""
     from stream_dmr.web.agreement import MEASUREMENT, agreements
     from stream_dmr.web.open_reports import run_folders
 

@@ -24,7 +24,7 @@ def run(
     log_json: Annotated[bool, "Log lines of JSON to stderr, for a service."] = False,
     timings: Annotated[bool, "At the end, show the time that each stage took."] = False,
 ) -> None:
-    """Measure the fish of a clip.
+    """Measure the fish of a video, a folder of pictures or a camera.
 
     Writes lengths.db, lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C
     ends the run early and keeps what was done.
@@ -75,7 +75,7 @@ def demo(
     ),
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Measure the fish of the embedded scene from its video, and print the true lengths beside.
+    """Measure the fish of the embedded scene by their mesh, and print the true lengths beside.
 
     Exits with 1 if a fish was not measured.
     """
@@ -134,7 +134,7 @@ def print_beside_truth(lengths: Path, truth: Path) -> bool:
 
 
 def setup() -> None:
-    """Compile the numeric loops, so that the first run need not; a run does it by itself else."""
+    """Compile the numeric loops now. Without this the first run compiles them."""
     from rich.console import Console
 
     from stream_dmr.pipeline.prepare_kernels import prepare_kernels

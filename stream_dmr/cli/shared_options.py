@@ -46,7 +46,7 @@ OverwriteOption = Annotated[bool, "Replace existing files."]
 
 PicturesOption = Annotated[
     str | None,
-    "The recorded clip, for pictures of the fish.",
+    "The video or folder that was measured, for pictures of the fish.",
     "the one that was measured, if it is still there",
 ]
 FisheriesOption = Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."]

@@ -22,7 +22,7 @@ def train(
         Path | None, "Folder of photographs without fish, to put your own fish before."
     ] = None,
     init: Annotated[
-        Path | None, "Weights to start from; with --images the shipped ones by themselves."
+        Path | None, "Weights to start from; with --images the shipped ones unless given."
     ] = None,
     config: Annotated[Path | None, "A config.toml; its [train] is used."] = None,
     device: Annotated[Device, "Where to compute."] = "cpu",

@@ -21,7 +21,7 @@ def verify(
         "The device's FILE.pub: all that it signed is checked by it as well. A digest needs it.",
     ] = None,
 ) -> None:
-    """Check that results are still what their run measured, and say what was changed.
+    """Check that results are still what their run measured, and report each change.
 
     Exit code 1: something was changed. 3: nothing but what an interrupted run leaves, or one that
     goes on.

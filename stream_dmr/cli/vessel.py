@@ -94,7 +94,7 @@ def digest(
     key: Annotated[Path | None, "The device's private key, which signs it; see keygen."] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write what a day of a run was into one file of at most 50 kB, to be sent ashore.
+    """Write a day of a run into one small file (50 kB, or what its fish need), to be sent ashore.
 
     It has the fish, hauls, positions, hours watched, alarms, hashes of the recordings, and small
     pictures of as many fish as there is room for. `fleet` shows it, `verify --key` checks it.

@@ -20,7 +20,9 @@ from stream_dmr.cli.shared_options import (
 from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.recording.selection import Selection
 
-_Source = Annotated[str | None, "The clip that was recorded, for pictures recorded by reference."]
+_Source = Annotated[
+    str | None, "The video or folder that was measured, for pictures recorded by reference."
+]
 
 
 def view(

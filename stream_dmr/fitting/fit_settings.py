@@ -38,7 +38,7 @@ class FitMeshSettings(Settings):
         "held as they hang",
     )
     tilt_std_rad: float = Field(
-        default=0.3, gt=0, description="std of a tilt out of the way in which fish hang, rad"
+        default=0.3, gt=0, description="std of a fish's tilt away from how it hangs, see hang, rad"
     )
     bend_std_rad: float = Field(
         default=0.5, gt=0, description="std of a joint's bend within its broad side, rad"

@@ -31,10 +31,10 @@ class ZonesSettings(Settings):
         "Without any zone fates are not asked for",
     )
     dropped: Points = Field(
-        default=[], description="of the one in which fish fall off the hook, frame px"
+        default=[], description="corners of the polygon in which fish fall off the hook, frame px"
     )
     cut_off: Points = Field(
-        default=[], description="of the one in which lines are cut with the fish on them, frame px"
+        default=[], description="corners of that in which lines are cut with fish on them, frame px"
     )
     min_share: float = Field(
         default=0.5,

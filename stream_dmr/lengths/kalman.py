@@ -61,8 +61,8 @@ class SmoothLengthSettings(Settings):
     std_factor: float = Field(
         default=0.85,
         gt=0,
-        description="of the std to which all these parts add up; they overlap, so that stds were "
-        "1.2 to 1.7 times too large for simulated fish that hang",
+        description="factor of the sum of all these stds: the parts overlap, so that without it "
+        "stds of simulated fish that hang were 1.2 to 1.7 times too large",
     )
     upward_share: float = Field(
         default=0.62,

@@ -36,8 +36,8 @@ class RunOptions:
     source: Annotated[str, "A video, a folder of pictures, rtsp://... or a camera's index."]
     out: Annotated[
         Path,
-        "Folder for the results. With those of an earlier run in it a video is refused, a camera "
-        "or a folder of clips goes on.",
+        "Folder for the results. If it has those of an earlier run, a video is refused; a camera "
+        "or a folder of clips continues.",
         "runs/<name of the source>",
     ] = None  # type: ignore[assignment]  # __post_init__ replaces it
     calibration: Annotated[
@@ -115,7 +115,9 @@ class ReplayOptions:
         None
     )
     source: Annotated[
-        str | None, "The recorded clip, for --from crop.", "the run's, if it is unchanged"
+        str | None,
+        "The video or folder that was measured, for --from crop.",
+        "the run's, if it is unchanged",
     ] = None
     boxes: Annotated[Path | None, "As in the run, for --from crop."] = None  # for both of the run
     masks: Annotated[Path | None, "As in the run, for --from crop."] = None

@@ -54,8 +54,8 @@ class CropFishSettings(Settings):
     segmenter_sizes_px: list[_PictureSize] = Field(
         default=[128],
         min_length=1,
-        description="widths of the pictures of a crop that the segmenter sees, multiples of 32 px, "
-        "those that the frame has; of several it sees the mirrored pictures too, and the mean "
+        description="widths at which the segmenter sees a crop, multiples of 32 px, without those "
+        "that the frame can't fill; with several it sees the mirrored crop too, and the mean "
         "counts. Stills: [128, 192, 256]",
     )
     second_look: bool = Field(

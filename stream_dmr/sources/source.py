@@ -126,8 +126,8 @@ class ReadFramesSettings(Settings):
     )
     orientation: Literal["auto", "upright", "sensor"] = Field(
         default="auto",
-        description="pictures of a folder that by their EXIF are to be turned: upright as it says, "
-        "or as the sensor saw them; auto: the sensor with a calibration, which is the sensor's",
+        description="how pictures are read whose EXIF asks for a rotation: rotated (upright) or as "
+        "the sensor saw them; auto: sensor with a calibration, else upright",
     )
     silence_s: float = Field(
         default=20.0,

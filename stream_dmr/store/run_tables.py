@@ -161,7 +161,8 @@ class FrameRow:
     length_mm: float | None
     length_std_mm: float | None
     iou: float | None  # overlap of the fitted mesh with the mask, 0 to 1
-    accepted: bool  # `true` where the frame counted
+    # `true` if it counted when it was measured; by all frames of the fish an `outlier` may count
+    accepted: bool
     reason: str  # [why it did not](troubleshooting.md#reasons)
 
 

@@ -1,7 +1,8 @@
-"""The plan of the imports between rooms, as an SVG: docs/images/plan.svg.
+"""The plan of the imports between packages, as an SVG: docs/images/plan.svg.
 
-Rooms stand from top to bottom in the order of `tests.test_architecture.ROOMS`. An arc from one room
-down to another says that the upper imports the lower. Arcs that a chain of others implies are grey.
+Packages stand from top to bottom in the order of `tests.test_architecture.PACKAGES`. An arc from
+one package down to another says that the upper imports the lower. Arcs that a chain of others
+implies are grey.
 """
 
 import ast
@@ -9,7 +10,7 @@ from functools import cache
 from typing import NamedTuple
 from xml.sax.saxutils import escape
 
-from tests.test_architecture import FILES, ROOMS, ROOT, imports, is_inside, module_of
+from tests.test_architecture import FILES, PACKAGES, ROOT, imports, is_inside, module_of
 
 PACKAGE = ROOT / "stream_dmr"
 _GROUND = "ground floor"
@@ -23,14 +24,14 @@ _STYLE = """
 
 
 class Plan(NamedTuple):
-    """Rooms from the top down, each with what it does, and who imports whom."""
+    """Packages from the top down, each with what it does, and who imports whom."""
 
-    rooms: dict[str, str]
+    packages: dict[str, str]
     imports: set[tuple[str, str]]
 
 
 def room_name(module: str) -> str:
-    """The package of a module; modules beside the packages are one room, except the API."""
+    """The package of a module; modules beside the packages are one package, except the API."""
     if module == "stream_dmr":
         return module
     if module == "stream_dmr.api":
@@ -41,26 +42,29 @@ def room_name(module: str) -> str:
 
 @cache
 def read_plan() -> Plan:
-    """The rooms as they are and the imports between them."""
+    """The packages as they are and the imports between them."""
     between = {
         (room_name(module_of(path)), room_name(name))
         for path in FILES
         for name in imports(path)
         if is_inside(name, ["stream_dmr"])
     }
-    rooms = dict.fromkeys(room_name(room) for room in ROOMS)
+    packages = dict.fromkeys(room_name(package) for package in PACKAGES)
     return Plan(
-        rooms={name: _description(name) for name in rooms},
+        packages={name: _description(name) for name in packages},
         imports={(upper, lower) for upper, lower in between if upper != lower},
     )
 
 
 def direct(plan: Plan) -> set[tuple[str, str]]:
     """Imports that no chain of others implies: the transitive reduction."""
-    below = {room: {lower for upper, lower in plan.imports if upper == room} for room in plan.rooms}
+    below = {
+        package: {lower for upper, lower in plan.imports if upper == package}
+        for package in plan.packages
+    }
     reached: dict[str, set[str]] = {}
-    for room in reversed(plan.rooms):  # whatever it imports stands below it, so has been seen
-        reached[room] = below[room].union(*(reached[lower] for lower in below[room]))
+    for package in reversed(plan.packages):  # whatever it imports stands below it, so has been seen
+        reached[package] = below[package].union(*(reached[lower] for lower in below[package]))
     return {
         (upper, lower)
         for upper, lower in plan.imports
@@ -70,9 +74,9 @@ def direct(plan: Plan) -> set[tuple[str, str]]:
 
 def draw_plan(plan: Plan) -> str:
     """The plan as the text of an SVG."""
-    height = 2 * _TOP_PX + _ROW_PX * len(plan.rooms)
+    height = 2 * _TOP_PX + _ROW_PX * len(plan.packages)
     width = _BOX_PX + _TEXT_PX + _ARCS_PX
-    rows = {room: _TOP_PX + _ROW_PX * (i + 0.5) for i, room in enumerate(plan.rooms)}
+    rows = {package: _TOP_PX + _ROW_PX * (i + 0.5) for i, package in enumerate(plan.packages)}
     shown = direct(plan)
     arcs = sorted(plan.imports, key=lambda arc: (arc in shown, rows[arc[0]], rows[arc[1]]))
     lines = [
@@ -81,7 +85,7 @@ def draw_plan(plan: Plan) -> str:
         '<defs><marker id="head" orient="auto" markerWidth="7" markerHeight="7" refX="6" refY="3">'
         '<path d="M0,0 L6,3 L0,6 z"/></marker></defs>',
         f'<rect x="0" y="0" width="{width}" height="{height}" style="fill: #fff; stroke: none"/>',
-        *(_room(room, text, rows[room]) for room, text in plan.rooms.items()),
+        *(_room(package, text, rows[package]) for package, text in plan.packages.items()),
         *(_arc(rows[upper], rows[lower], (upper, lower) in shown) for upper, lower in arcs),
         "</svg>",
     ]
@@ -106,12 +110,12 @@ def _arc(top: float, bottom: float, is_direct: bool) -> str:
     )
 
 
-def _description(room: str) -> str:
-    if room == _GROUND:
+def _description(package: str) -> str:
+    if package == _GROUND:
         loose = [file.stem for file in sorted(PACKAGE.glob("*.py")) if file.stem != "__init__"]
         return ", ".join(loose)
-    file = PACKAGE / ("" if room == "stream_dmr" else room) / "__init__.py"
-    file = PACKAGE / "api.py" if room == "api" else file
+    file = PACKAGE / ("" if package == "stream_dmr" else package) / "__init__.py"
+    file = PACKAGE / "api.py" if package == "api" else file
     text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
-    assert text, f"{file}: expected a docstring, got none; say in one line what the room does"
+    assert text, f"{file}: expected a docstring, got none; say in one line what the package does"
     return text.splitlines()[0].rstrip(".").replace("`", "")
