@@ -43,7 +43,7 @@ def test_page_of_the_files_names_every_table_and_column(tmp_path):
 
 
 def test_plan_leaves_out_what_a_chain_implies():
-    plan = Plan(rooms=dict.fromkeys("abc", ""), imports={("a", "b"), ("b", "c"), ("a", "c")})
+    plan = Plan(packages=dict.fromkeys("abc", ""), imports={("a", "b"), ("b", "c"), ("a", "c")})
     assert direct(plan) == {("a", "b"), ("b", "c")}
 
 

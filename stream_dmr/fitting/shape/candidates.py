@@ -194,8 +194,11 @@ def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
     """A line for each stock, such as: 62 % of the fish: like salmon, 18 % broader (+-3 %)."""
     by_name = {form.name: form for form in forms}
     for stock in stocks:
-        words = changes(by_name[stock.name], stock)
-        yield f"{stock.share:.0%} of the fish: like {stock.name}, {words}"
+        yield _line(by_name[stock.name], stock)
+
+
+def _line(form: CandidateShape, stock: CandidateShape) -> str:
+    return f"{stock.share:.0%} of the fish: like {form.name}, {changes(form, stock)}"
 
 
 def changes(form: CandidateShape, stock: CandidateShape) -> str:
@@ -231,22 +234,24 @@ class Believed(NamedTuple):
 def believable(forms: CandidateShapes, stocks: CandidateShapes) -> Believed:
     """The stocks that can be of fish, doubtful ones with a larger covariance.
 
-    In the place of stocks that can't be of fish, or of too few, a fish may have any of the forms.
+    Each has the name of the form that it is nearest to. In the place of stocks that can't be of
+    fish, or of too few, a fish may have any of the forms.
     """
     believed, doubts = list[CandidateShape](), list[str]()
-    for stock, line in zip(stocks, describe(forms, stocks), strict=True):
+    for stock in stocks:
         if stock.share < _MIN_SHARE:
             continue
-        # From the form that it is nearest to.
-        off = min(
-            (stock.coefficients - form.coefficients for form in forms), key=distance_from_form
-        )
+        coefficients = stock.coefficients
+        form = min(forms, key=lambda form: distance_from_form(coefficients - form.coefficients))
+        off = coefficients - form.coefficients
         doubt = max(0.0, (distance_from_form(off) / _MAX_DISTANCE - 1) / (_NEVER - 1))
+        covariance = stock.covariance + min(doubt, 1.0) * np.outer(off, off)
+        stock = stock._replace(name=form.name, covariance=covariance)
         if doubt <= 1:
-            covariance = stock.covariance + doubt * np.outer(off, off)
-            believed.append(stock._replace(covariance=covariance))
+            believed.append(stock)
         if doubt > 0:
             words = _HARDLY if doubt <= 1 else _NO_FISH
+            line = _line(form, stock)
             doubts.append(f"the masks show a shape that fish {words} ({line}){_REMEDY}")
     if not believed:
         return Believed(forms, doubts)

@@ -78,6 +78,13 @@ def test_one_fish_among_twenty_is_no_stock():
     assert len(found.shapes.choice(0).indices) == len(FORMS) + 1
 
 
+def test_a_stock_has_the_name_of_the_form_that_it_has_come_nearest_to():
+    (kept,) = believed(
+        PIKE._replace(coefficients=FORMS_BY_NAME["cod"].coefficients, share=1.0)
+    ).shapes
+    assert kept.name == "cod"
+
+
 def test_a_fin_on_one_side_is_no_doubt():
     shape = PIKE.coefficients.copy()
     shape[LEFT][7] += 0.7  # an anal fin that is up in every mask
