@@ -9,6 +9,11 @@ def reason_of(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
+def first_line(error: Exception, *, most: int = 120) -> str:
+    """The first line of an error, such as of onnxruntime's long ones, or the name of its class."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)[:most]
+
+
 class UserError(Exception):
     """The user's input is wrong: the command prints this one line and exits with 2.
 

@@ -66,11 +66,7 @@ def import_(
     folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
     viame: Annotated[Path, "Its `export --viame` after corrections in DIVE or VIAME."],
     reviewer: Annotated[str, "Your name, for the verdicts.", "who is logged in"] = "",
-    source: Annotated[
-        str | None,
-        "The video or folder that was measured, for fish that were drawn.",
-        "the one that was measured, if it is still there",
-    ] = None,
+    source: PicturesOption = None,
 ) -> None:
     """Take what was corrected in a file of tracks as verdicts and edits into lengths.db.
 

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.detection.onnx_outputs import MASKS, NUM_OUTPUTS, Layout, OutputShapeError, decode
-from stream_dmr.errors import ModelError
+from stream_dmr.errors import ModelError, first_line
 from stream_dmr.geometry import components, whole_pixels
 from stream_dmr.messages import Frame
 from stream_dmr.networks.onnx_session import open_session
@@ -230,7 +230,7 @@ class OnnxDetector:
         except Exception as error:  # onnxruntime's errors share no base class
             raise self._refusal(
                 f"a model that takes a picture of {self._input_size[0]}x{self._input_size[1]} px",
-                f"{error}".strip().splitlines()[0][:120],
+                first_line(error),
                 remedy="set [detect_fish] onnx_input_px",
             ) from None
         if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):

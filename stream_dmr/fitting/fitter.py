@@ -27,7 +27,7 @@ from stream_dmr.fitting.solver.descent import evaluate
 from stream_dmr.fitting.solver.outline import project
 from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.starts import cold_starts, recentered
-from stream_dmr.fitting.target import Solution, Solver, Target
+from stream_dmr.fitting.target import TOWARD_CAMERA, Solution, Solver, Target
 from stream_dmr.fitting.uncertainty import (
     covariance,
     freed,
@@ -38,8 +38,6 @@ from stream_dmr.fitting.uncertainty import (
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.reasons import Reason
 from stream_dmr.template.template import Template
-
-_TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
 # L_rec that a cold fit must gain to replace the pose of the frame before, and with it the end at
 # which the head is. Chosen by trial.
@@ -81,7 +79,7 @@ class Fitter:
         A `candidate` gives the template its shape, with a breadth as free as it is unknown; its
         `index` is kept in the fits. `with_covariance`: fits contain the parameters' covariance.
         """
-        normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
+        normal = TOWARD_CAMERA if plane_normal is None else plane_normal
         self._index = index
         self._shape_covariance = individual_covariance()
         self._breadth_std = 0.0  # of the log breadth, if it is learnt

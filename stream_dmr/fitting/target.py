@@ -126,6 +126,9 @@ _LEAST_HALF_PX = 1.0  # half the breadth of the slimmest fish of a mask that is 
 _BORDER_PX = 0.6  # nearer to the picture's border there is no edge of the fish, only of the picture
 
 
+TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])  # normal of a plane that faces the camera
+
+
 class Target(NamedTuple):
     """Plain arrays, which kernels take as they are: `stream_dmr.compiled`."""
 

@@ -47,13 +47,12 @@ from stream_dmr.fitting.solver.linear_blend import (
     skinning_weights,
 )
 from stream_dmr.fitting.solver.problem import SCALE, TRANSLATION, Problem, prior_loss
-from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.target import TOWARD_CAMERA, Target
 from stream_dmr.fitting.uncertainty import freed
 from stream_dmr.geometry import points_along
 from stream_dmr.messages import FishCrop, FittedShape
 from stream_dmr.template.template import Template
 
-_TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 _JOINTS = (1 / 6, 1 / 2, 5 / 6)  # of the mesh, as shares of its midline
 _TRIED = 3  # starts, the likeliest; all others end in the same poses (measured)
 _ROUGH_ITERATIONS, _ITERATIONS = 8, 30  # on half the resolution, and on all of it
@@ -111,7 +110,7 @@ class TwoMaskFitter:
         """The first camera's shape, fitted to both masks; None if the rays don't meet in front."""
         sights = first, second
         levels, settings = self._levels(first.shape.candidate)
-        targets = [Target.from_crop(s.crop, plane_normal=_TOWARD_CAMERA) for s in sights]
+        targets = [Target.from_crop(s.crop, plane_normal=TOWARD_CAMERA) for s in sights]
         rough = _TwoProblems(levels.coarse, settings, [t.coarse() for t in targets], self._R)
         fine = _TwoProblems(levels.fine, settings, targets, self._R)
         alone = [

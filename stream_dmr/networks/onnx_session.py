@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stream_dmr.errors import ModelError
+from stream_dmr.errors import ModelError, first_line
 
 _NUM_THREADS = 2  # the other stages need cores as well
 _CPU = "CPUExecutionProvider"
@@ -54,7 +54,7 @@ def open_session(
             content or str(path), options, providers=[*zip(by, own, strict=True)]
         )
     except Exception as error:  # onnxruntime's errors share no base class
-        reason = f"{error}".strip().splitlines()[0][:160]
+        reason = first_line(error, most=160)
         raise ModelError(
             f"{path}: expected an ONNX model, but it can't be loaded: {reason}"
         ) from None

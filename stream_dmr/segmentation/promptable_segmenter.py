@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.errors import ModelError
+from stream_dmr.errors import ModelError, first_line
 from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.segmentation.segmenter import SegmentedFish
 
@@ -93,8 +93,9 @@ class PromptableSegmenter:
         try:
             logits = self._run(image, box)
         except Exception as error:  # onnxruntime's errors share no base class
-            reason = f"{error}".strip().splitlines()[0][:120]
-            raise self._refusal("a model that takes a picture and a box", reason) from None
+            raise self._refusal(
+                "a model that takes a picture and a box", first_line(error)
+            ) from None
         if min(logits.shape) < 16:
             raise self._refusal("an output of at least 16x16 px", f"{logits.shape}")
         if not np.isfinite(logits).all():

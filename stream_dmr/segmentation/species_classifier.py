@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stream_dmr.errors import ModelError, reason_of
+from stream_dmr.errors import ModelError, first_line, reason_of
 from stream_dmr.files import read_text
 from stream_dmr.messages import FishCrop
 from stream_dmr.networks.onnx_session import open_session
@@ -88,8 +88,7 @@ class SpeciesClassifier:
         try:
             logits = self._logits(np.full((64, 64, 3), 90, np.uint8))
         except Exception as error:  # onnxruntime's errors share no base class
-            reason = f"{error}".strip().splitlines()[0][:120]
-            raise self._refusal("a model that takes one picture", reason) from None
+            raise self._refusal("a model that takes one picture", first_line(error)) from None
         if len(logits) != len(self.codes) or not np.isfinite(logits).all():
             raise self._refusal(f"{len(self.codes)} finite logits", f"{len(logits)} numbers")
 

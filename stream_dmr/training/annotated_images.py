@@ -18,7 +18,13 @@ from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size
 from stream_dmr.segmentation.mask_outlines import decode_coco
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX, FishPatch
-from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
+from stream_dmr.training.samples import (
+    PART_SHARE,
+    TrainingSample,
+    crop_affine,
+    draw_part_box,
+    jitter_box,
+)
 from stream_dmr.training.surroundings import BACKGROUND_PX
 from stream_dmr.training.training_scene import FADED_SHARE, draw_fade
 
@@ -178,7 +184,6 @@ def _refuse_huge(path: Path) -> None:
 _CUTOUT_PX = 448  # width and height of a cutout: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
-_PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
 _VALIDATION_EVERY = 5  # every fifth image is kept for validation
 
 
@@ -225,7 +230,7 @@ def draw_annotated_sample(
     rows, columns = np.nonzero(cutout.pixels[..., 3])
     points = transformed(np.column_stack([columns, rows]).astype(np.float64), rotation)
     box = np.concatenate([points.min(axis=0) - 0.5, points.max(axis=0) + 0.5])
-    if rng.random() < _PART_SHARE:
+    if rng.random() < PART_SHARE:
         box = draw_part_box(rng, box, points)
     everywhere = np.array([-np.inf, -np.inf, np.inf, np.inf])
     box = jitter_box(rng, box, limits=everywhere)

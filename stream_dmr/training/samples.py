@@ -191,7 +191,7 @@ _OVERVIEW = np.array([-1.0, -1.0, 1.0, 1.0])  # scene units
 _NO_BOX_SHARE = 0.12  # of the examples: no box, the mask is of all fish
 _NO_FISH_SHARE = 0.10  # of the examples: the box is around no fish, as detectors' boxes may be
 _SPOT_SHARE = 0.45  # of those without a fish: around a spot that stands out in a background
-_PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
+PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
 _MIN_VISIBLE = 0.2  # of the target fish; with less visible the scene is drawn again
 
 
@@ -199,7 +199,7 @@ def draw_sample(rng: np.random.Generator, size_px: int, *, bank: PatchBank) -> T
     """One crop, `size_px` wide and high, with its true mask and ends."""
     kind = rng.random()
     is_boxed, is_empty = kind >= _NO_BOX_SHARE, kind >= 1 - _NO_FISH_SHARE
-    is_part = not is_empty and kind >= 1 - _NO_FISH_SHARE - _PART_SHARE
+    is_part = not is_empty and kind >= 1 - _NO_FISH_SHARE - PART_SHARE
     if (
         is_empty
         and rng.random() < _SPOT_SHARE

@@ -227,7 +227,7 @@ def _lobe_share(
 # Std of one frame's log breadth: 5 % by the individual, as in `individual_covariance`, the rest by
 # bends and edges. Chosen.
 _FRAME_STD = float(np.hypot(0.05, 0.06))
-_FRAMES_WORTH = 2.0  # the frames of a fish are much alike
+FRAMES_WORTH = 2.0  # independent ones, that frames of a fish are worth, far apart as they are
 _OUTLIERS = 1e-4  # density of a breadth that is none: a wrong mask
 _IMPOSSIBLE = 1e-30  # density of proportions that no body form has, for their logarithm
 # Spreads of the roll that are weighed, all alike before; with the last any roll is about as likely.
@@ -264,7 +264,7 @@ def infer_proportions(
     """
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
     counts = [len(values) for values in seen.values()]
-    worth = np.repeat([min(_FRAMES_WORTH, count) / count for count in counts], counts)
+    worth = np.repeat([min(FRAMES_WORTH, count) / count for count in counts], counts)
     log_density = np.log(_densities(slant_std_rad) + _OUTLIERS)
     log_posterior = np.empty((len(_BREADTHS), len(_THICKNESSES), log_density.shape[2]))
     for n, breadth in enumerate(_BREADTHS):

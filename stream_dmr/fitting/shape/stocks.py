@@ -19,7 +19,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.fitting.body import MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
-from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
+from stream_dmr.fitting.shape.space import FRAMES_WORTH, NUM_COEFFICIENTS, form_precision, reshaped
 from stream_dmr.fitting.shape.stock import FormOdds, PosedTarget, Stock, StockFitter
 from stream_dmr.fitting.solver.contour_solver import ContourSolver
 from stream_dmr.fitting.starts import cold_starts
@@ -111,8 +111,6 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
     return [items[place] for place in np.unique(places)]
 
 
-# The frames of a fish, far apart, determine its shape like two independent frames.
-_FRAMES_WORTH = 2.0
 # Weight of a fish's evidence for a form, summed over the frames that decided it: they follow each
 # other, so that three are worth little more than one. All fish of a stock are worth no more than
 # three of them: masks of one film are too broad or too slim alike.
@@ -242,7 +240,7 @@ class _StockLearner:
                 list(self._fitter.nats([replace(frame) for frame in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
             ]
-            best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
+            best = int(np.argmin(FRAMES_WORTH * np.mean(nats, axis=1) - shares))
             frames[best] += options[best]
         return [
             self._learn(
@@ -292,7 +290,7 @@ class _StockLearner:
 def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
     apart = a.stock.nats | b.stock.nats
-    gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
+    gains = [FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
     # How many of the shape's coefficients the fish of b determine rather than the prior.
     num_effective = NUM_COEFFICIENTS - float(np.trace(b.stock.covariance @ form_precision()))
     return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - num_effective
