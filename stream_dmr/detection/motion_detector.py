@@ -193,6 +193,9 @@ def _is_thick(blob: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"], length_p
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
 _MIN_CHANGE = 8  # grey levels between two pictures; less is noise
 _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
+# Share of foreign pixels from which on the background is learnt anew: after a black picture, a lamp
+# that is switched on or another shot it would take hundreds of pictures.
+_ANOTHER_SCENE = 0.5
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
 # By the levels of a mask of moving pixels: errors of the model must fade there at last.
 _RATES = np.array([1] + [0.02] * 255, np.float32)
@@ -285,6 +288,8 @@ class MotionDetector:
     ) -> tuple[BackgroundModel, UInt8[np.ndarray, "h w 3"]]:
         """The background after the camera's motion, and the picture in the background's pixels."""
         grey = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+        if self._is_foreign is not None and np.mean(self._is_foreign) > _ANOTHER_SCENE:
+            self._begin_anew(grey.shape)
         if self._background is None or self._is_foreign is None or self._before is None:
             self._camera.step(grey, is_background=np.ones(grey.shape, bool))
             self._background = BackgroundModel(
@@ -298,6 +303,13 @@ class MotionDetector:
         if self._background_from_picture is _IDENTITY:
             return self._background, small
         return self._background, warp(small, self._background_from_picture)
+
+    def _begin_anew(self, shape: tuple[int, ...]) -> None:
+        """Forget the background; the place of the picture's middle in the scene stays."""
+        middle = np.array([shape[1] / 2, shape[0] / 2])
+        self._shift_px += middle - self._background_from_picture @ [*middle, 1.0]
+        self._background, self._is_foreign = None, None
+        self._background_from_picture = _IDENTITY
 
     def _follow(
         self,

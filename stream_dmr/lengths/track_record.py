@@ -20,6 +20,10 @@ from stream_dmr.lengths.kalman import (
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts
 
+# Largest ratio of the median lengths of a track's last and first third, and its fewest frames: of
+# 250 simulated fish none has more than 1.15. One with more swims towards the camera or away, the
+# camera zooms, or the track has gone over to another fish.
+_MAX_DRIFT, _MIN_DRIFT_FRAMES = 1.3, 9
 _CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
 
@@ -96,7 +100,9 @@ class TrackLength:
         used = self._filter.frames if self._filter else []
         outliers = Counter({Reason.OUTLIER: len(self._measurements) - len(used)})
         reason = self._refusal or ("" if used[-1:] == [self._last.frame_index] else Reason.OUTLIER)
-        length_mm, std_mm, ci95_mm = self._result(len(used))
+        length_mm, std_mm, ci95_mm = (
+            (None, None, None) if is_final and self._has_drifted() else self._result(len(used))
+        )
         smoothed_mm, smoothed_std_mm = self._smoothed() if is_final else (np.zeros(0),) * 2
         return LengthEstimate(
             frame_index=self._last.frame_index,
@@ -134,6 +140,15 @@ class TrackLength:
         share = self._settings.upward_share
         ends_mm = length_mm + _CI95_STDS * std_mm * np.array([share - 1.0, share])
         return length_mm, std_mm, ends_mm
+
+    def _has_drifted(self) -> bool:
+        used = set(self._filter.frames if self._filter else [])
+        lengths_mm = [m.length_mm for m in self._measurements if m.frame_index in used]
+        third = len(lengths_mm) // 3
+        if len(lengths_mm) < _MIN_DRIFT_FRAMES:
+            return False
+        first_mm, last_mm = np.median(lengths_mm[:third]), np.median(lengths_mm[-third:])
+        return bool(max(first_mm, last_mm) > _MAX_DRIFT * min(first_mm, last_mm))
 
     def _smoothed(self) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
         """Length and std in mm at each used frame, given all of them."""

@@ -6,7 +6,7 @@ remainder as large as a fish is another fish, even if it was never seen before.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -115,6 +115,8 @@ def _components(mask: UInt8[np.ndarray, "H W"]) -> list[Bool[np.ndarray, "H W"]]
 def _piece(piece: Bool[np.ndarray, "H W"], whole: Candidate, corner: tuple[int, int]) -> Candidate:
     x, y, w, h = cv2.boundingRect(piece.view(np.uint8))
     box = np.array([x, y, x + w, y + h], np.float64) + np.tile(corner, 2)
-    return Candidate(
-        bbox_xyxy_px=box, score=whole.score, foreground=piece[y : y + h, x : x + w].copy()
-    )
+    place = whole.place_px
+    if place is not None:
+        place = place + (box.reshape(2, 2) - whole.bbox_xyxy_px.reshape(2, 2)).mean(axis=0)
+    foreground = piece[y : y + h, x : x + w].copy()
+    return replace(whole, bbox_xyxy_px=box, foreground=foreground, place_px=place)

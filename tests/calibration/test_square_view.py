@@ -18,12 +18,17 @@ from tests.support.command import invoke
 ENDS = np.array([[40.0, 60.0], [140.0, 60.0]])
 
 
-@given(st.floats(0, 500), st.floats(0, 400), st.floats(5, 500))
+@given(st.floats(0, 500), st.floats(0, 400), st.floats(15, 500))
 def test_the_known_length_is_measured_as_it_is(u: float, v: float, length_mm: float):
     ends = np.array([[u, v], [630.0, 470.0]])
     calibration = calibrate_squarely(ends, length_mm, LENS)
     assert scale_of_ends(ends, length_mm, calibration).error_mm == pytest.approx(0, abs=1e-6)
     assert calibration.plane.distance_mm == calibration.plane.translation_mm[2] > 0
+
+
+def test_a_plane_that_no_run_would_take_is_refused():
+    with pytest.raises(CalibrationError, match="10 mm or more from the camera, got"):
+        calibrate_squarely(np.array([[0.0, 0.0], [630.0, 470.0]]), 1.0, LENS)
 
 
 def test_the_focal_length_is_that_of_the_diagonal():

@@ -74,6 +74,14 @@ def test_a_change_of_light_is_no_fish():
     assert not any(find_all(lit))
 
 
+@pytest.mark.parametrize("before", [0.0, 0.25])
+def test_after_a_black_picture_or_a_lamp_switched_on_fish_are_found_at_once(before: float):
+    wall = texture(2)[:240, :320]
+    dark = [(before * wall).astype(np.uint8)] * 8
+    found = find_all([*dark, *(draw_fish(wall, 60 + 8 * i, 120) for i in range(16))])
+    assert sum(len(candidates) == 1 for candidates in found[12:]) >= 10
+
+
 def test_equal_pictures_give_equal_fish():
     pictures = [draw_fish(wall, 60 + 8 * i, 90) for i, wall in enumerate(pan(9, (2.0, 0.5), 12))]
     once, twice = find_all(pictures), find_all(pictures)

@@ -263,11 +263,20 @@ def test_no_frame_has_a_smaller_std_than_the_floor():
 
 
 def test_a_fish_whose_frames_contradict_each_other_gets_no_length():
-    frames = [frame(i, 300.0 + 150.0 * (7 * i % 11), std_mm=30.0) for i in range(1, 11)]
+    frames = [frame(i, 300.0 + 450.0 * (i % 4), std_mm=30.0) for i in range(1, 13)]
     final = run(frames)[-1]
     assert (final.length_mm, final.length_std_mm, final.ci95_mm) == (None, None, None)
     assert final.status == "too uncertain"
     assert run(frames, max_std_ratio=1.0)[-1].status == "measured"
+
+
+@pytest.mark.parametrize(("growth", "is_measured"), [(0.2, True), (0.7, False), (-0.5, False)])
+def test_a_fish_that_gets_ever_longer_or_shorter_gets_no_length(growth, is_measured):
+    """It swims towards the camera, or the camera zooms: each frame agrees with those beside it."""
+    lengths_mm = 700 * np.geomspace(1, 1 + growth, 30)
+    final = run([frame(i, z, std_mm=0.1 * z) for i, z in enumerate(lengths_mm, start=1)])[-1]
+    assert (final.length_mm is not None) == is_measured
+    assert is_measured or final.status == Reason.TOO_UNCERTAIN
 
 
 def test_accepted_frame_without_numbers_is_our_fault():

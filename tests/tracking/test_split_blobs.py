@@ -1,5 +1,7 @@
 """Blobs that several fish share are split where the fish are predicted; single fish stay whole."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -64,6 +66,17 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
         assert share(others, in_frame(piece)) < 0.25
         assert share(true, in_frame(piece)) > 0.65
         assert piece.score == 0.8
+
+
+def test_a_piece_has_its_place_in_the_scene_and_the_looks_of_the_whole():
+    one, other, camera_px = fish(200, 120), fish(220, 220), np.array([7.0, -3.0])
+    whole = candidate_of(one | other)
+    middle = whole.bbox_xyxy_px.reshape(2, 2).mean(axis=0)
+    whole = replace(whole, place_px=middle + camera_px, looks=0.4)
+    for piece in split_merged_blob(whole, [predicted(one), predicted(other)]):
+        middle = piece.bbox_xyxy_px.reshape(2, 2).mean(axis=0)
+        np.testing.assert_allclose(piece.place_px, middle + camera_px)
+        assert piece.looks == 0.4
 
 
 @given(st.integers(-40, 40), offsets)
