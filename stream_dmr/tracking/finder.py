@@ -6,7 +6,7 @@ masks decide: two fish share no pixels.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -49,6 +49,8 @@ class Sightings:
     any_cut_out: bool = False  # a track had sure masks, but did not move or look like a fish
     best_score: float = 0.0  # of any candidate
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
+    without: int = 0  # stills without a fish that counts
+    some_without: list[str] = field(default_factory=list)  # names of the first of these
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -117,6 +119,20 @@ def explain_no_fish(
     )
 
 
+_MAX_NAMED = 5  # pictures without fish
+
+
+def explain_pictures_without(seen: Sightings) -> str:
+    """Return one line: which stills have no fish that counts, and what to do."""
+    names = ", ".join(seen.some_without)
+    if seen.without > len(seen.some_without):
+        names += ", ..."
+    return (
+        f"no fish that counts in {seen.without} of {seen.frames} pictures: {names}; where they "
+        "show fish, lower [track_fish] min_score or min_mask_confidence, or give --boxes"
+    )
+
+
 # Share of a mask that lies inside another mask. In 70 stills, repeats and fins had 0.85 and more of
 # their pixels in the fish's mask, neighbours at most 0.14; see docs/research/real-lengths.md.
 _SAME = 0.5
@@ -163,6 +179,7 @@ class TrackedFish:
         self._evidence: dict[int, FishEvidence] = {}  # of the frame's tracks
         self._scores: dict[int, float] = {}  # of the detector, likewise
         self._found_any = False
+        self._name = ""  # of the last picture
 
     def detect(self, frame: Frame) -> list[Detection]:
         """All tracks seen in a frame, by track number. Frames must come in order."""
@@ -171,6 +188,7 @@ class TrackedFish:
         else:
             candidates = [] if self._passes_over(frame) else self._detector.find(frame)
         tracked = self._tracker.step(frame, candidates)
+        self._name = frame.source
         self._seen.frames += 1
         self._seen.candidates += len(candidates)
         scores = [candidate.score for candidate in candidates]
@@ -254,6 +272,10 @@ class TrackedFish:
         if self._are_stills:
             single = without_repeats({track: crops[track] for track in fish}, self._scores)
             fish = {track: fish[track] for track in single}
+            if not fish:
+                self._seen.without += 1
+                if len(self._seen.some_without) < _MAX_NAMED:
+                    self._seen.some_without.append(self._name)
         self._found_any |= bool(fish)
         self._seen.any_cut_out |= any(map(self._confirmation.is_cut_out, crops))
         self._seen.tracks = max([self._seen.tracks, *crops])
@@ -287,9 +309,14 @@ class TrackedFish:
 
     @property
     def warnings(self) -> list[str]:
-        """Why there are no fish, if there are none. A fish missed among others is not noticed."""
-        if self._found_any or self._seen.frames == 0:
+        """Why there are no fish, or which stills have none.
+
+        A fish missed among others of its picture or film is not noticed.
+        """
+        if self._seen.frames == 0:
             return []
+        if self._found_any:
+            return [explain_pictures_without(self._seen)] if self._seen.without else []
         return [explain_no_fish(self._seen, self._detector.refused, self._settings)]
 
     @property

@@ -7,7 +7,13 @@ import pytest
 
 from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.messages import Frame
-from stream_dmr.tracking.finder import Sightings, TrackedFish, TrackFishSettings, explain_no_fish
+from stream_dmr.tracking.finder import (
+    Sightings,
+    TrackedFish,
+    TrackFishSettings,
+    explain_no_fish,
+    explain_pictures_without,
+)
 
 LIMITS = TrackFishSettings(min_mask_confidence=0.8)
 
@@ -39,6 +45,14 @@ def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
 def test_the_line_says_how_large_a_fish_of_a_still_must_be():
     stills = TrackFishSettings(across_frames=False)
     assert "a twentieth of the picture" in explain_no_fish(Sightings(frames=9), {}, stills)
+
+
+@pytest.mark.parametrize(("count", "names"), [(2, "a.jpg, b.jpg;"), (9, "a.jpg, b.jpg, ...;")])
+def test_pictures_without_fish_among_others_are_named(count, names):
+    line = explain_pictures_without(
+        replace(LOOKED_AT, frames=20, without=count, some_without=["a.jpg", "b.jpg"])
+    )
+    assert line.startswith(f"no fish that counts in {count} of 20 pictures: {names}")
 
 
 SHORT = "shorter than [detect_fish] motion_min_length"
