@@ -21,9 +21,9 @@ from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts
 
 # Largest ratio of the median lengths of a track's last and first third, and its fewest frames: of
-# 250 simulated fish none has more than 1.15. One with more swims towards the camera or away, the
-# camera zooms, or the track has gone over to another fish.
-_MAX_DRIFT, _MIN_DRIFT_FRAMES = 1.3, 9
+# 300 simulated fish, bent severely some of them, none has more than 1.35. One with more swims
+# towards the camera or away, the camera zooms, or the track has gone over to another fish.
+_MAX_DRIFT, _MIN_DRIFT_FRAMES = 1.5, 15
 _CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
 
