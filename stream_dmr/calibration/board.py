@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stream_dmr.calibration.calibration_file import MIN_DEPTH_MM
 from stream_dmr.calibration.corners import BoardCorners, PrintedBoard, draw_corners, read_grey
 from stream_dmr.calibration.known_length import require_ends
 from stream_dmr.calibration.lens import (
@@ -195,17 +194,10 @@ def calibrate_squarely(
 ) -> Calibration:
     """A plane at a right angle to the camera's axis on which two pixels are so far apart.
 
-    Raises CalibrationError for ends that are no two points of the picture, or no length, or where
-    the plane would be nearer than a calibration file may have it.
+    Raises CalibrationError for ends that are no two points of the picture, or no length.
     """
     require_ends(ends_px, length_mm, camera)
     rays = camera.back_project(ends_px)  # at depth 1
     depth_mm = length_mm / float(np.linalg.norm(rays[1] - rays[0]))
-    if depth_mm < MIN_DEPTH_MM:
-        raise CalibrationError(
-            f"--length-mm: expected a plane {MIN_DEPTH_MM:g} mm or more from the camera, got "
-            f"{depth_mm:.2g} mm; check that the length is in mm; for a microscope give it in um, "
-            "and read mm as um"
-        )
     plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, depth_mm]))
     return Calibration(camera=camera, plane=plane)

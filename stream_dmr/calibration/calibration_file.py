@@ -23,7 +23,7 @@ _KEYS = (*_LENS_KEYS, *_PLANE_KEYS)
 # Chosen: a plane seen at less than 3 degrees gives no usable depth; a plane nearer than 10 mm means
 # that tvec is in metres.
 _MIN_SLOPE = np.sin(np.radians(3.0))
-MIN_DEPTH_MM = 10.0
+_MIN_DEPTH_MM = 10.0
 _MAX_ANGLE = 2 * np.pi + 1e-6
 
 
@@ -65,10 +65,12 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
     """Write a calibration file that `load_calibration` and OpenCV read.
 
     The numbers are read back bit by bit, except for the plane's rotation, which is stored as a
-    rotation vector (error below 1e-12). Raises OutputError if the file can't be written.
+    rotation vector (error below 1e-12). Raises OutputError if the file can't be written, and
+    CalibrationError for a plane that `load_calibration` would refuse.
     """
     path = Path(path)
     camera, plane = calibration.camera, calibration.plane
+    _check_plane(camera, plane, path=path)
     # cv2.Rodrigues takes the angle from its cosine, which loses half the digits of small angles.
     rvec = Rotation.from_matrix(plane.rotation).as_rotvec()[:, None]
     flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
@@ -101,11 +103,11 @@ def _check_plane(camera: Camera, plane: ReferencePlane, *, path: Path) -> None:
     ray = camera.back_project(middle)[0]
     normal = plane.rotation[:, 2]
     slope = abs(normal @ ray) / np.linalg.norm(ray)
-    if slope < _MIN_SLOPE or abs(normal @ plane.translation_mm) < MIN_DEPTH_MM * slope:
+    if slope < _MIN_SLOPE or abs(normal @ plane.translation_mm) < _MIN_DEPTH_MM * slope:
         raise CalibrationError(
             f"{path}: rvec, tvec: expected a reference plane some distance in front of the camera, "
-            f"in mm, got one seen edge-on, or closer than {MIN_DEPTH_MM:g} mm; check that tvec is "
-            f"in mm, or {CALIBRATE}"
+            f"in mm, got one seen edge-on, or closer than {_MIN_DEPTH_MM:g} mm; check that tvec, "
+            f"or what was measured for it, is in mm, or {CALIBRATE}"
         )
     depth = plane.depth_mm(ray[None])[0]
     if depth < 0:

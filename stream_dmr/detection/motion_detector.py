@@ -288,7 +288,8 @@ class MotionDetector:
     ) -> tuple[BackgroundModel, UInt8[np.ndarray, "h w 3"]]:
         """The background after the camera's motion, and the picture in the background's pixels."""
         grey = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
-        if self._is_foreign is not None and np.mean(self._is_foreign) > _ANOTHER_SCENE:
+        foreign_px = 0 if self._is_foreign is None else np.count_nonzero(self._is_foreign)
+        if foreign_px > _ANOTHER_SCENE * grey.size:
             self._begin_anew(grey.shape)
         if self._background is None or self._is_foreign is None or self._before is None:
             self._camera.step(grey, is_background=np.ones(grey.shape, bool))
@@ -308,8 +309,7 @@ class MotionDetector:
         """Forget the background; the place of the picture's middle in the scene stays."""
         middle = np.array([shape[1] / 2, shape[0] / 2])
         self._shift_px += middle - self._background_from_picture @ [*middle, 1.0]
-        self._background, self._is_foreign = None, None
-        self._background_from_picture = _IDENTITY
+        self._background, self._background_from_picture = None, _IDENTITY
 
     def _follow(
         self,

@@ -6,6 +6,7 @@ averaging removes. Frames of one track are not independent measurements.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -100,9 +101,7 @@ class TrackLength:
         used = self._filter.frames if self._filter else []
         outliers = Counter({Reason.OUTLIER: len(self._measurements) - len(used)})
         reason = self._refusal or ("" if used[-1:] == [self._last.frame_index] else Reason.OUTLIER)
-        length_mm, std_mm, ci95_mm = (
-            (None, None, None) if is_final and self._has_drifted() else self._result(len(used))
-        )
+        length_mm, std_mm, ci95_mm = self._result(len(used), is_final=is_final)
         smoothed_mm, smoothed_std_mm = self._smoothed() if is_final else (np.zeros(0),) * 2
         return LengthEstimate(
             frame_index=self._last.frame_index,
@@ -128,7 +127,7 @@ class TrackLength:
         )
 
     def _result(
-        self, num_used: int
+        self, num_used: int, *, is_final: bool
     ) -> tuple[float, float, Float[np.ndarray, "2"]] | tuple[None, None, None]:
         """Length, std and 95 % interval in mm, once there are enough good frames that agree."""
         if self._filter is None or num_used < self._settings.min_frames:
@@ -137,16 +136,18 @@ class TrackLength:
         std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
         if std_mm > self._settings.max_std_ratio * length_mm:
             return None, None, None
+        if is_final and self._has_drifted(self._filter.frames):
+            return None, None, None
         share = self._settings.upward_share
         ends_mm = length_mm + _CI95_STDS * std_mm * np.array([share - 1.0, share])
         return length_mm, std_mm, ends_mm
 
-    def _has_drifted(self) -> bool:
-        used = set(self._filter.frames if self._filter else [])
-        lengths_mm = [m.length_mm for m in self._measurements if m.frame_index in used]
-        third = len(lengths_mm) // 3
-        if len(lengths_mm) < _MIN_DRIFT_FRAMES:
+    def _has_drifted(self, used: Sequence[int]) -> bool:
+        """True if the frames that were used get ever longer or shorter."""
+        if len(used) < _MIN_DRIFT_FRAMES:
             return False
+        frames, third = set(used), len(used) // 3
+        lengths_mm = [m.length_mm for m in self._measurements if m.frame_index in frames]
         first_mm, last_mm = np.median(lengths_mm[:third]), np.median(lengths_mm[-third:])
         return bool(max(first_mm, last_mm) > _MAX_DRIFT * min(first_mm, last_mm))
 

@@ -1,4 +1,4 @@
-"""config.toml: one typed table per node and room; unknown keys and wrong values are refused.
+"""config.toml: one typed table per node and package; unknown keys and wrong values are refused.
 
 `python -m stream_dmr.pipeline.config > config.toml` writes the file with every default.
 """

@@ -109,8 +109,9 @@ def explain_no_fish(
         )
     if seen.any_cut_out:
         return begin + (
-            f"{seen.tracks} shapes were followed; those with sure masks did not look like a fish "
-            "to the network; set [track_fish] min_fish_like_frames = 0 where they are fish"
+            f"{seen.tracks} shapes were followed; those with sure masks did not move, or did not "
+            "look like a fish to the network; set [track_fish] min_fish_like_frames = 0 where they "
+            "are fish"
         )
     return begin + (
         f"{seen.tracks} shapes were followed, none had a sure mask in a quarter of its frames and "
@@ -277,7 +278,9 @@ class TrackedFish:
                 if len(self._seen.some_without) < _MAX_NAMED:
                     self._seen.some_without.append(self._name)
         self._found_any |= bool(fish)
-        self._seen.any_cut_out |= any(map(self._confirmation.is_cut_out, crops))
+        self._seen.any_cut_out |= any(
+            self._confirmation.is_cut_out(track) and not self._may_count(track) for track in crops
+        )
         self._seen.tracks = max([self._seen.tracks, *crops])
         confidences = [crop.quality.mask_confidence or 0.0 for crop in crops.values()]
         self._seen.best_confidence = max([self._seen.best_confidence, *confidences])

@@ -30,7 +30,7 @@ class Plan(NamedTuple):
     imports: set[tuple[str, str]]
 
 
-def room_name(module: str) -> str:
+def package_name(module: str) -> str:
     """The package of a module; modules beside the packages are one package, except the API."""
     if module == "stream_dmr":
         return module
@@ -44,12 +44,12 @@ def room_name(module: str) -> str:
 def read_plan() -> Plan:
     """The packages as they are and the imports between them."""
     between = {
-        (room_name(module_of(path)), room_name(name))
+        (package_name(module_of(path)), package_name(name))
         for path in FILES
         for name in imports(path)
         if is_inside(name, ["stream_dmr"])
     }
-    packages = dict.fromkeys(room_name(package) for package in PACKAGES)
+    packages = dict.fromkeys(package_name(package) for package in PACKAGES)
     return Plan(
         packages={name: _description(name) for name in packages},
         imports={(upper, lower) for upper, lower in between if upper != lower},
@@ -85,14 +85,14 @@ def draw_plan(plan: Plan) -> str:
         '<defs><marker id="head" orient="auto" markerWidth="7" markerHeight="7" refX="6" refY="3">'
         '<path d="M0,0 L6,3 L0,6 z"/></marker></defs>',
         f'<rect x="0" y="0" width="{width}" height="{height}" style="fill: #fff; stroke: none"/>',
-        *(_room(package, text, rows[package]) for package, text in plan.packages.items()),
+        *(_row(package, text, rows[package]) for package, text in plan.packages.items()),
         *(_arc(rows[upper], rows[lower], (upper, lower) in shown) for upper, lower in arcs),
         "</svg>",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _room(name: str, text: str, y: float) -> str:
+def _row(name: str, text: str, y: float) -> str:
     return (
         f'<rect x="{_TEXT_PX}" y="{y - 12:g}" width="{_BOX_PX}" height="24" rx="4"/>'
         f'<text class="name" x="{_TEXT_PX + 8}" y="{y + 5:g}">{escape(name)}</text>'
