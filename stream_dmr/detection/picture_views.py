@@ -32,23 +32,28 @@ _SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part i
 # only their size shows it. See docs/research/real-lengths.md. And least share of the picture's
 # longer side: of shorter finds lamps and handles are as sure; see docs/research/real-pictures.md.
 _SHORTEST, _LEAST = 0.1, 0.05
+# Longer side of a view: a detector sees it smaller still, and a telephone's picture in full size
+# takes seconds to mirror and turn. See docs/research/start-and-memory.md.
+_MOST_PX = 2048
 
 
 def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
     """The candidates of a picture and of the mirrored one, each with the mean of its two scores.
 
     What is seen in one of them only has a score of 0 in the other: a fish is mostly seen in both,
-    other things less often (docs/research/real-pictures.md).
+    other things less often (docs/research/real-pictures.md). Silhouettes are left out: a mean box
+    has none.
     """
     width = frame.image.shape[1]
     image = np.ascontiguousarray(frame.image[:, ::-1])
     mirrored = [
-        replace(candidate, bbox_xyxy_px=np.array([width - x1, y0, width - x0, y1]))
+        replace(candidate, bbox_xyxy_px=np.array([width - x1, y0, width - x0, y1]), foreground=None)
         for candidate in detector.find(replace(frame, image=image))
         for x0, y0, x1, y1 in [candidate.bbox_xyxy_px]
     ]
     found = list[Candidate]()
-    for candidate in detector.find(frame):
+    for seen in detector.find(frame):
+        candidate = replace(seen, foreground=None)
         same = next((other for other in mirrored if _are_same(candidate, other)), None)
         if same is None:
             found.append(replace(candidate, score=candidate.score / 2))
@@ -89,16 +94,33 @@ def _close_views(
         side = round(max(size * longer_side(bbox_xyxy_px), _MIN_CLOSE_PX))
         beyond = np.array(image.shape[1::-1]) - side
         corner = np.floor(middle - side / 2).clip(np.minimum(beyond, 0), np.maximum(beyond, 0))
-        columns, rows = (
-            np.clip(np.arange(first, first + side).astype(int), 0, count - 1)
-            for first, count in zip(corner, image.shape[1::-1], strict=True)
-        )
-        view = image[rows[:, None], columns]
-        x0, y0, x1, y1 = bbox_xyxy_px - np.tile(corner, 2)
+        left, top = corner.astype(int).tolist()
+        view, scale = _shrunk(_part(image, left, top, side))
+        x0, y0, x1, y1 = (bbox_xyxy_px - np.tile(corner, 2)) * scale
         if is_turned:
-            yield np.ascontiguousarray(np.rot90(view)), np.array([y0, side - x1, y1, side - x0])
+            end = len(view)
+            yield np.ascontiguousarray(np.rot90(view)), np.array([y0, end - x1, y1, end - x0])
         else:
             yield view, np.array([x0, y0, x1, y1])
+
+
+def _part(
+    image: UInt8[np.ndarray, "H W 3"], left: int, top: int, side: int
+) -> UInt8[np.ndarray, "S S 3"]:
+    """A square of a picture, whose edges go on where it is larger."""
+    height, width = image.shape[:2]
+    inside = image[max(top, 0) : top + side, max(left, 0) : left + side]
+    above, before = max(-top, 0), max(-left, 0)
+    below, behind = max(top + side - height, 0), max(left + side - width, 0)
+    return cv2.copyMakeBorder(inside, above, below, before, behind, cv2.BORDER_REPLICATE)
+
+
+def _shrunk(image: UInt8[np.ndarray, "H W 3"]) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
+    """A picture of at most `_MOST_PX`, and its size over the given one's."""
+    scale = _MOST_PX / max(image.shape[:2])
+    if scale >= 1:
+        return image, 1.0
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
 
 
 def find_in_view(
@@ -116,6 +138,25 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
 
     Each has the mean of its score there and in two close views.
     """
+    small, scale = _shrunk(frame.image)
+    limits = np.tile(frame.image.shape[1::-1], 2)
+    found = [
+        replace(fish, bbox_xyxy_px=(fish.bbox_xyxy_px / scale).clip(0, limits))
+        for fish in _find_in_views(detector, replace(frame, image=small))
+    ]
+    least_px = _LEAST * max(frame.image.shape[:2])
+    found = [
+        replace(fish, score=(fish.score + 2 * look_closer(detector, frame, fish.bbox_xyxy_px)) / 3)
+        for fish in found
+        if fish.score >= _FAINT and longer_side(fish.bbox_xyxy_px) >= least_px
+    ]
+    sure = [longer_side(fish.bbox_xyxy_px) for fish in found if fish.score >= _SURE_NEAR]
+    longest_px = max(sure, default=0.0)
+    return [fish for fish in found if longer_side(fish.bbox_xyxy_px) >= _SHORTEST * longest_px]
+
+
+def _find_in_views(detector: Detector, frame: Frame) -> list[Candidate]:
+    """The candidates of a picture, of one with a rim and of its parts, each fish once."""
     height, width = frame.image.shape[:2]
     rim_px = round(_RIM * max(height, width))
     afar = cv2.copyMakeBorder(frame.image, rim_px, rim_px, rim_px, rim_px, cv2.BORDER_REPLICATE)
@@ -139,15 +180,7 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     for candidate in sorted([*whole, *others], key=lambda candidate: -candidate.score):
         if not any(_are_same(candidate, fish) for fish in kept):
             kept.append(candidate)
-    least_px = _LEAST * max(height, width)
-    kept = [
-        replace(fish, score=(fish.score + 2 * look_closer(detector, frame, fish.bbox_xyxy_px)) / 3)
-        for fish in kept
-        if fish.score >= _FAINT and longer_side(fish.bbox_xyxy_px) >= least_px
-    ]
-    sure = [longer_side(fish.bbox_xyxy_px) for fish in kept if fish.score >= _SURE_NEAR]
-    longest_px = max(sure, default=0.0)
-    return [fish for fish in kept if longer_side(fish.bbox_xyxy_px) >= _SHORTEST * longest_px]
+    return kept
 
 
 def _is_part(candidate: Candidate, fish: Candidate) -> bool:

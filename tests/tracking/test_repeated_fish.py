@@ -145,3 +145,32 @@ def test_dirt_beside_a_fish_of_ten_times_its_length_or_in_a_wide_picture_is_none
     lengths = sorted(float(one.bbox_xyxy_px[2] - one.bbox_xyxy_px[0]) for one in found)
     is_dirt = dirt < 0.05 * 500 or (fish > 0 and score >= 0.5 and dirt < 0.1 * fish)
     assert lengths == [dirt] * (not is_dirt) + [fish] * (fish > 0)
+
+
+class _Outlines(_Boxes):
+    """The same, with silhouettes; remembers the longest side of a picture that it was shown."""
+
+    longest_px = 0
+
+    def find(self, frame):
+        self.longest_px = max(self.longest_px, *frame.image.shape)
+        found = super().find(frame)
+        sizes = [np.ptp(one.bbox_xyxy_px.reshape(2, 2), axis=0).astype(int) for one in found]
+        return [
+            replace(one, foreground=np.ones((height, width), bool))
+            for one, (width, height) in zip(found, sizes, strict=True)
+        ]
+
+
+@given(st.integers(0, 1000), st.integers(0, 1000), st.integers(300, 3000))
+@settings(max_examples=5)  # a picture of ten megapixels each
+def test_the_full_size_of_a_telephones_picture_is_looked_at_in_part_only(left, top, length):
+    picture = np.zeros((2500, 4100, 3), np.uint8)
+    picture[top : top + length // 3, left : left + length] = 255
+    detector = _Outlines(0.8)
+    [fish] = find_in_still(detector, frame_of(picture))
+    expected = [left, top, left + length, top + length // 3]
+    np.testing.assert_allclose(fish.bbox_xyxy_px, expected, atol=4)
+    assert fish.score == pytest.approx(0.8)
+    assert fish.foreground is None  # those of two views differ, and neither fits a mean box
+    assert detector.longest_px < 3100
