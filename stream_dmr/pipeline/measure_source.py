@@ -1,5 +1,6 @@
 """Measure the fish of one source."""
 
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -24,7 +25,7 @@ from stream_dmr.pipeline.learn_shapes import (
     with_learnt_shapes,
 )
 from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
-from stream_dmr.pipeline.run_folder import result_names
+from stream_dmr.pipeline.run_folder import prepare_folder, result_names
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
 from stream_dmr.pipeline.run_options import RunOptions
@@ -32,7 +33,7 @@ from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs,
 from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.open_results import learnt_files
+from stream_dmr.store.open_results import learnt_files, require_free_names
 from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_CUT_OFF, SOURCE_ENDED, STOPPED
 from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP
 
@@ -211,10 +212,28 @@ def measure_source(
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
     cv2.setNumThreads(1)
     summary, mesh_fits = _measure(request, stop=stop, observer=observer)
-    if not mesh_fits:
-        auto = replace(request, template=AUTO, overwrite=True)
-        summary, _ = _measure(auto, stop=stop, observer=observer)
-    return summary
+    return summary if mesh_fits else _measured_again(request, summary, stop, observer)
+
+
+def _measured_again(
+    request: RunOptions, first: RunSummary, stop: threading.Event, observer: RunObserver
+) -> RunSummary:
+    """Measure as with `--template auto` beside the first results, and replace these at the end.
+
+    A stop or an error leaves the first results as they are.
+    """
+    out = request.out
+    require_free_names(out, overwrite=request.overwrite)  # for their shape
+    with tempfile.TemporaryDirectory(prefix=".again-", dir=out) as folder:
+        again = replace(request, template=AUTO, out=Path(folder))
+        summary, _ = _measure(again, stop=stop, observer=observer)
+        if stop.is_set():
+            observer.warn(f"stopped before that: {out} has the lengths by the mesh that was given")
+            return first
+        prepare_folder(out, overwrite=True)
+        for path in sorted(Path(folder).iterdir()):
+            path.rename(out / path.name)
+    return replace(summary, files=[out / path.name for path in summary.files])
 
 
 def _measure(

@@ -53,13 +53,13 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.topics import SECOND_TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
 from stream_dmr.recording.whole_records import WholeRecords
-from stream_dmr.store.fish import database_of, read_measured_fish, read_runs
+from stream_dmr.store.fish import database_of, last_run_like, read_measured_fish
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import require_free_names
 from stream_dmr.store.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
-from stream_dmr.store.schema import CUT_OFF_BY_STOP
+from stream_dmr.store.schema import CUT_OFF_BY_STOP, HAULS, WATCHED, read_rows
 from stream_dmr.tracking.finder import open_finder
 
 
@@ -70,20 +70,19 @@ def read_recorded_run(
 
     None and no flags without such a run in it. Raises OutputError if lengths.db is damaged.
     """
-    folders = [path if path.is_dir() else path.parent for path in recordings]
-    databases = [database for folder in folders if (database := database_of(folder)) is not None]
     expected = run_facts(header)
     facts, flags = None, dict[int, Sequence[str]]()
-    for database in dict.fromkeys(databases):
+    for database in _databases(recordings):
         flags |= {fish.estimate.track_id: fish.flags for fish in read_measured_fish(database)}
-        made = [run for run in read_runs(database).values() if _is_same(run, expected)]
-        facts = made[-1] if made else facts
+        facts = last_run_like(database, expected) or facts
     return facts, flags
 
 
-def _is_same(run: RunFacts, expected: RunFacts) -> bool:
-    names = ("command", "config_sha256", "calibration_sha256", "template_sha256")
-    return all(getattr(run, name) == getattr(expected, name) for name in names)
+def _databases(recordings: Sequence[Path]) -> list[Path]:
+    """The lengths.db beside recordings, each once."""
+    folders = [path if path.is_dir() else path.parent for path in recordings]
+    found = (database_of(folder) for folder in dict.fromkeys(folders))
+    return [database for database in found if database is not None]
 
 
 @contextmanager
@@ -104,7 +103,9 @@ def open_replay_outputs(
     header = new_header(request, recording.header, inputs, second)
     try:
         known, flags = read_recorded_run(request.recordings, recording.header)
+        is_readable = True
     except OutputError as error:
+        is_readable = False
         observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
         known, flags = None, {}
     signer = None if request.key is None else Signer(request.key)
@@ -122,6 +123,8 @@ def open_replay_outputs(
         files.attach(store, repaired=[])
         stack.callback(partial(files.finish, with_recordings=True))
         store.count_frames(None if known is None else known.frames_promised)
+        if is_readable:
+            _take_over_hauls(request, store)
         lengths = stack.enter_context(closing(LengthsTable(out, store)))
         save_learnt(inputs, out, source=header.source)
         recorder = Recorder(
@@ -149,6 +152,30 @@ def open_replay_outputs(
         finally:
             results.finish()
         store.end(STOPPED if stop.is_set() else _end_of(request, known))
+
+
+def _take_over_hauls(request: ReplayOptions, store: LengthStore) -> None:
+    """Copy the hauls beside the recordings, and what of the replayed time was watched."""
+    span_ns = request.selection.time_ns
+    for database in _databases(request.recordings):
+        for row in read_rows(database, HAULS):
+            values = {name: row[name] for name in ("what", "name", "timestamp_ns", "said_by")}
+            store.append(HAULS, row["name"], values, is_urgent=False)
+        for row in read_rows(database, WATCHED):
+            first_ns, last_ns = row["first_ns"], row["last_ns"]
+            if span_ns is not None:
+                first_ns, last_ns = max(first_ns, span_ns[0]), min(last_ns, span_ns[1])
+            if first_ns > last_ns:
+                continue
+            whole_ns = row["last_ns"] - row["first_ns"]
+            share = (last_ns - first_ns) / whole_ns if whole_ns > 0 else 1.0
+            values = {
+                "first_ns": first_ns,
+                "last_ns": last_ns,
+                "frames": round(row["frames"] * share),
+                "frames_lost": round(row["frames_lost"] * share),
+            }
+            store.append(WATCHED, str(first_ns), values, is_urgent=False)
 
 
 def _end_of(request: ReplayOptions, recorded: RunFacts | None) -> str:

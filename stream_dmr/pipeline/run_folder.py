@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from stream_dmr.errors import OutputError, RecordingError
@@ -15,6 +16,7 @@ from stream_dmr.recording.recorder import STEM
 from stream_dmr.recording.repair import Repair, repair_recordings
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.store.batch_folder import OUTCOME
+from stream_dmr.store.fish import last_run_like
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
@@ -167,7 +169,11 @@ def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
     missing = [estimate for estimate in final if estimate.track_id not in stored]
     if not missing:
         return
-    with closing(LengthStore(folder, run_facts(recording.header), signer=signer)) as store:
+    facts = run_facts(recording.header)
+    if (known := last_run_like(folder / NAME, facts)) is not None:
+        names = ("vessel", "trip", "haul", "utc_zero_ns")  # which no recording has
+        facts = replace(facts, **{name: getattr(known, name) for name in names})
+    with closing(LengthStore(folder, facts, signer=signer)) as store:
         store.end(f"not by itself: its lengths are {FROM_RECORDING}")
         for estimate in missing:
             store.add(estimate, flags=[FROM_RECORDING])

@@ -66,6 +66,10 @@ class TrackPart:
         """The part from a frame on; it may be empty."""
         return replace(self, first_frame=max(self.first_frame, frame_index))
 
+    def overlaps(self, track: LengthEstimate) -> bool:
+        """True if it has frames of a whole track."""
+        return self.first_frame <= track.last_frame and track.first_frame <= self.last_frame
+
     @property
     def is_empty(self) -> bool:
         return self.first_frame > self.last_frame

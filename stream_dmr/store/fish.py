@@ -197,10 +197,14 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
         tracks = {row["track_id"]: fish(row, estimate_of(row), row["run_id"]) for row in stored}
         made = dict[int, Fish]()
         for track_id, edited in edits.items():
-            parts = sorted(edited.parts, key=lambda part: (part.last_frame, part.first_frame))
-            known = [tracks[part.track_id] for part in parts if part.track_id in tracks]
-            estimate = _with_catch(estimate_of(edited.row), parts, known)
-            run_id = known[0].run_id if known else list(runs)[-1]  # that of its first frames
+            known = [
+                (part, tracks[part.track_id])
+                for part in edited.parts
+                if part.track_id in tracks and part.overlaps(tracks[part.track_id].estimate)
+            ]
+            known.sort(key=lambda pair: pair[1].estimate.first_frame)
+            estimate = _with_catch(estimate_of(edited.row), known)
+            run_id = known[0][1].run_id if known else list(runs)[-1]  # that of its first frames
             made[track_id] = fish(edited.row, estimate, run_id, origin=edited.kind)
     except (ValueError, KeyError) as error:
         raise OutputError(
@@ -210,13 +214,13 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
 
 
 def _with_catch(
-    estimate: LengthEstimate, parts: Sequence[TrackPart], known: Sequence[Fish]
+    estimate: LengthEstimate, known: Sequence[tuple[TrackPart, Fish]]
 ) -> LengthEstimate:
     """With the species of the first track, and the fate of the last track if it ended there."""
     if not known:
         return estimate
-    first, last = known[0].estimate, known[-1].estimate
-    is_whole = parts[-1].last_frame >= last.last_frame
+    first, (part, last) = known[0][1].estimate, (known[-1][0], known[-1][1].estimate)
+    is_whole = part.last_frame >= last.last_frame
     return replace(
         estimate,
         species_code=first.species_code,
@@ -254,6 +258,17 @@ def _clock_notes(database: Path, runs: Mapping[str, RunFacts]) -> Iterator[str]:
                 f"the run of {runs[run_id].source} ended {early_s:.0f} s before it began: its "
                 "machine's clock was set back meanwhile"
             )
+
+
+def last_run_like(database: Path, expected: RunFacts) -> RunFacts | None:
+    """The last run with this command, config, calibration and template. Raises OutputError."""
+    names = ("command", "config_sha256", "calibration_sha256", "template_sha256")
+    made = [
+        run
+        for run in read_runs(database).values()
+        if all(getattr(run, name) == getattr(expected, name) for name in names)
+    ]
+    return made[-1] if made else None
 
 
 def assigns_ids(folder: Path) -> bool:
@@ -298,11 +313,11 @@ def _run_of(row: Mapping[str, Any]) -> RunFacts:
 
 def is_same_species(name: str, other: str) -> bool:
     """True if two texts name the same species, by its code, a name, or its template."""
-    return _species_named(name) == _species_named(other)
+    return species_named(name) == species_named(other)
 
 
 @cache
-def _species_named(text: str) -> str:
+def species_named(text: str) -> str:
     """The code of the species that a text names, else the text, whatever its capitals."""
     form = load_body_forms().get(text.strip().casefold())
     scientific_name = None if form is None else form.title.split(", ")[-1]

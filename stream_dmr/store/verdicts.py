@@ -188,6 +188,9 @@ def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, R
         ),
         f"the number of another fish, got {verdict.duplicate_of}": verdict.kind == "duplicate"
         and (verdict.duplicate_of not in track_ids or verdict.duplicate_of == verdict.track_id),
+        f"fish {verdict.other_fish} to count, as what is merged into it goes with it; withdraw its "
+        "verdicts first": verdict.kind == "merge"
+        and reviews.get(verdict.other_fish or 0, NOT_REVIEWED).decision in NOT_COUNTED,
         f"a fish that is not itself a duplicate of fish {verdict.track_id}; withdraw that first": (
             verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews)
         ),

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 from stream_dmr.errors import UserError
-from stream_dmr.store.fish import database_of, read_measured_fish
+from stream_dmr.store.fish import database_of, read_measured_fish, species_named
 from stream_dmr.store.verdicts import Review, blind_readings, read_verdicts, reviews_of
 
 REVIEW, MEASUREMENT = "review", "measurement"
@@ -145,7 +145,7 @@ def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
         yield Reading(
             name=name,
             decisions={fish: r.decision for fish, r in by_fish.items() if r.decision},
-            species={fish: r.species.casefold() for fish, r in by_fish.items() if r.species},
+            species={fish: species_named(r.species) for fish, r in by_fish.items() if r.species},
             lengths_mm=lengths,
         )
 

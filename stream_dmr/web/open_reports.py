@@ -18,6 +18,7 @@ from stream_dmr.store.fish import (
     database_of,
     read_fish,
     read_measured_fish,
+    read_runs,
     recorded_track,
     run_notes,
 )
@@ -66,6 +67,7 @@ def open_report(
         else VesselTrack(read_positions(database)),
         watched_ns=[] if database is None else watched_times(database),
         notes=run_notes(path),
+        runs=[] if database is None else [*read_runs(database).values()],
     )
 
 

@@ -24,6 +24,7 @@ from stream_dmr.store.edits import NO_EDITS, TrackEdits
 from stream_dmr.store.effort import HaulEffort
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import FisheriesSettings
+from stream_dmr.store.run_facts import RunFacts
 from stream_dmr.store.trip import VesselTrack
 from stream_dmr.tables import utc_text
 from stream_dmr.template.template_file import bundled_names
@@ -50,6 +51,7 @@ class RunReport:
     track: VesselTrack | None = None
     watched_ns: Sequence[int] = ()  # capture times of the first and last frames between pauses
     notes: Sequence[str] = ()  # for readers, about the run
+    runs: Sequence[RunFacts] = ()  # empty for a recording without its database
 
     @property
     def title(self) -> str:
@@ -74,17 +76,18 @@ def trip_section(
     fish = [caught for report in reports for caught in report.fish if caught.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
     drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
-    heading = _heading(fish)
-    if not (heading or drawn or any(caught.haul for caught in fish)):
+    facts = [run for report in reports for run in report.runs]
+    heading = _heading(fish, facts)
+    if not (heading or drawn or any(row["haul"] != "-" for row in rows)):
         return ""
     return render("report/trip.html", heading=heading, rows=rows, map=drawn, is_folded=is_folded)
 
 
-def _heading(fish: Sequence[Fish]) -> str:
+def _heading(fish: Sequence[Fish], runs: Sequence[RunFacts]) -> str:
     """Vessel, trip and hauls, and the time from the first fish to the last."""
     parts = [
-        _named("", {caught.facts.vessel for caught in fish}),
-        _named("trip", {caught.facts.trip for caught in fish}),
+        _named("", {facts.vessel for facts in (*runs, *(caught.facts for caught in fish))}),
+        _named("trip", {facts.trip for facts in (*runs, *(caught.facts for caught in fish))}),
         _named("haul", {caught.haul for caught in fish}),
     ]
     heading = ", ".join(part for part in parts if part)
@@ -112,7 +115,7 @@ def _span(*times: str) -> str:
 def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
     """A row of the table for each haul: texts by column heading."""
     counted = [caught for caught in report.fish if caught.counts]
-    zeros = {caught.facts.utc_zero_ns for caught in counted}
+    zeros = {facts.utc_zero_ns for facts in report.runs}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
     for effort in report.efforts:
         fish = [caught for caught in counted if caught.haul == effort.haul]

@@ -257,6 +257,15 @@ class VerdictRecorder:
                         f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
                         "must be undone first"
                     )
+        if undone.kind in ("correct", "withdraw"):
+            counted = standing(earlier)
+            for later in earlier[number:]:
+                is_of_fish = later.kind == "correct" and later.track_id == undone.track_id
+                if is_of_fish and later in counted:  # its length is of all points moved by then
+                    raise UserError(
+                        f"undo: {later.reviewer} has moved points of fish {later.track_id} since; "
+                        "that must be undone first"
+                    )
         return replace(verdict, track_id=undone.track_id, undoes=number)
 
     def _corrected(

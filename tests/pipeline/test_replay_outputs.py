@@ -1,5 +1,6 @@
 """A replay's output is a run's output: exports, reviews and verify take it as one."""
 
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -9,9 +10,12 @@ import pytest
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.messages import FittedMesh
+from stream_dmr.pipeline.haul_log import write_haul
 from stream_dmr.recording.view_geometry import MeshRebuilder
+from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.store.run_facts import SOURCE_ENDED
+from stream_dmr.store.schema import WATCHED, read_rows
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.verdict_recorder import SubmittedVerdict, VerdictRecorder
 from tests.support.command import invoke, rows
@@ -47,6 +51,23 @@ def test_it_has_the_fish_of_the_run_with_vessel_trip_haul_and_flags(run: Path, a
         assert one.estimate.length_mm == pytest.approx(other.estimate.length_mm)
         assert (one.iou, one.flags) == (other.iou, other.flags)
     assert [one.flags for one in fish] == [[], [FLAG]]
+
+
+def test_it_has_the_hauls_and_the_effort_of_the_run(run: Path, tmp_path: Path):
+    copy, again = Path(shutil.copytree(run, tmp_path / "run")), tmp_path / "again"
+    for what, at in (("start", "0"), ("end", "0.25")):
+        write_haul(copy, what, name="A", at=at, said_by="Ada")
+    assert invoke(f"replay {copy}", {"--from": "smooth", "--out": str(again)}).code == 0
+    before, after = (
+        read_effort(out / "lengths.db", read_stored_fish(out / "lengths.db"))
+        for out in (copy, again)
+    )
+    assert after == before
+    assert {one.haul: one.hours_watched > 0 for one in after}["A"]
+    part = tmp_path / "part"
+    options = {"--from": "smooth", "--time": "0.1:0.3", "--out": str(part)}
+    assert invoke(f"replay {copy}", options).code == 0
+    assert 0 < sum(row["frames"] for row in read_rows(part / "lengths.db", WATCHED)) < 6
 
 
 def test_it_is_verified_exported_and_reviewed(again: Path, tmp_path: Path):

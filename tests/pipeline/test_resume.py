@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,9 @@ from stream_dmr.recording.record import make_record
 from stream_dmr.recording.repair import repair_recordings
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.sources.source import ResumePoint, Source
+from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.schema import EVENTS, read_rows
 from tests.support.command import rows
 from tests.support.final_estimates import FACTS, fish
@@ -135,6 +138,16 @@ def test_lengths_that_only_a_recording_has_are_taken_over_once(store: LengthStor
     with closing(LengthStore(tmp_path, FACTS)) as later:
         assert len(later.estimates()) == len(FINAL)
     assert FROM_RECORDING in (tmp_path / "lengths.db").read_bytes().decode(errors="replace")
+
+
+def test_recovered_fish_are_of_the_vessel_trip_and_haul_of_their_run(tmp_path: Path):
+    record(tmp_path, is_torn=False)
+    said = {"vessel": "Sea Bird", "trip": "7", "haul": "b", "utc_zero_ns": 10**18}
+    with closing(LengthStore(tmp_path, replace(run_facts(header()), **said))) as store:
+        store.add(FINAL[0])
+    list(recover_folder(tmp_path))
+    for stored in read_stored_fish(tmp_path / "lengths.db"):
+        assert {name: getattr(stored.facts, name) for name in said} == said
 
 
 def test_a_folder_in_use_is_not_repaired(store: LengthStore, tmp_path: Path):

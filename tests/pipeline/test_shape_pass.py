@@ -12,6 +12,7 @@ import pytest
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.seal import known_files
+from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.files import FolderLock
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import reshaped
@@ -290,6 +291,26 @@ def test_a_mesh_of_other_fish_is_not_believed(
     assert rows(out / "lengths.csv") == rows(learnt[0] / "lengths.csv")  # as with auto
     assert [path.name for path in out.glob("recording*.mcap")] == ["recording.mcap"]
     assert set(known_files(out)) == set(known_files(learnt[0]))
+
+
+def test_a_stop_while_fish_are_measured_again_keeps_the_first_lengths(clip: Path, tmp_path: Path):
+    observer = Listener(stop_after=6)  # of four frames each time
+    out = measured(clip, tmp_path / "out", observer, template=str(clip / "slim.ply")).out
+    assert [line for line in observer.warnings if "has the lengths by the mesh" in line]
+    (row,) = rows(out / "lengths.csv")
+    assert row["frames_seen"] == "4"
+    assert not list(out.glob(".again*"))
+    assert verify(out)[0] == []
+
+
+def test_a_mesh_to_measure_with_is_not_replaced_by_what_is_learnt(clip: Path, tmp_path: Path):
+    for suffix in ("ply", "toml"):
+        shutil.copy(clip / f"slim.{suffix}", tmp_path / f"template.{suffix}")
+    mine = (tmp_path / LEARNT).read_bytes()
+    with pytest.raises(OutputError, match=rf"{LEARNT}: expected a name that is free"):
+        measured(clip, tmp_path, Listener(), template=str(tmp_path / LEARNT))
+    assert (tmp_path / LEARNT).read_bytes() == mine
+    assert len(rows(tmp_path / "lengths.csv")) == 1
 
 
 @pytest.mark.slow

@@ -90,6 +90,14 @@ def fish_of(out: Path) -> list[Any]:
     return read_stored_fish(out / "lengths.db")
 
 
+def test_a_species_is_the_same_by_its_code_and_by_its_name(out: Path):
+    submit(ReviewQueue([open_report(out)], reviewer="Ada"), "species", 1, species="COD")
+    blind = ReviewQueue([open_report(out, as_measured=True)], reviewer="Grace", blind=True)
+    submit(blind, "species", 1, species="Gadus morhua")
+    pairs = {(pair.first, pair.second): pair for pair in agreements([out])}
+    assert (pairs["review", "Grace"].species.count, pairs["review", "Grace"].species.same) == (1, 1)
+
+
 def test_equal_seeds_draw_equal_fish(out: Path):
     queue = ReviewQueue([open_report(out)] * 2, reviewer="Ada", sample=AuditSample(size=2, seed=3))
     text = queue.page("x")

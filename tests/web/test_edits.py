@@ -149,6 +149,66 @@ def test_tracks_that_were_mixed_up_are_put_right(queue: ReviewQueue, out: Path):
     assert verify(out)[0] == []
 
 
+@pytest.fixture
+def parted(tmp_path: Path) -> Path:
+    """A halibut in frames 1 to 4, dropped, and a cod in frames 5 to 8, landed."""
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=[[1]] * 4 + [[2]] * 4)
+    measure_source(request(clip, tmp_path / "out"), stop=threading.Event())
+    known = {1: ("HAL", "dropped"), 2: ("COD", "landed")}
+    with closing(sqlite3.connect(tmp_path / "out" / "lengths.db")) as database:
+        for track_id, values in known.items():
+            change = "UPDATE fish SET species_code = ?, fate = ? WHERE track_id = ?"
+            database.execute(change, (*values, track_id))
+        database.commit()
+    return tmp_path / "out"
+
+
+def named(out: Path) -> dict[int, tuple[str, str]]:
+    stored = read_stored_fish(out / "lengths.db")
+    return {one.estimate.track_id: (one.estimate.species_code, one.fate) for one in stored}
+
+
+@pytest.mark.parametrize(("gone", "kept"), [(1, 2), (2, 1)])
+def test_a_merged_fish_has_the_first_species_and_the_last_fate(parted: Path, gone: int, kept: int):
+    before, queue = named(parted), ReviewQueue([open_report(parted)], reviewer="Ada")
+    submit(queue, "merge", gone, other_fish=kept, sure=True)
+    assert named(parted)[kept] == ("HAL", "landed")
+    made = submit(queue, "split", kept, frame_index=5)  # where it was merged
+    [other] = made.keys() - {kept}
+    assert [named(parted)[kept], named(parted)[other]] == [before[1], before[2]]
+
+
+@pytest.mark.parametrize(
+    "first", [{"kind": "duplicate", "duplicate_of": 1}, {"kind": "reject", "reason": "a glove"}]
+)
+def test_no_fish_is_merged_into_one_that_does_not_count(parted: Path, first: dict[str, Any]):
+    queue = ReviewQueue([open_report(parted)], reviewer="Ada")
+    submit(queue, track_id=2, **first)
+    with pytest.raises(UserError, match="expected fish 2 to count"):
+        submit(queue, "merge", 1, other_fish=2, sure=True)
+    counted = [fish for fish in read_stored_fish(parted / "lengths.db") if fish.counts]
+    assert [fish.estimate.track_id for fish in counted] == [1]
+
+
+@pytest.mark.parametrize("undone", ["correct", "withdraw"])
+def test_moved_points_that_others_build_on_are_not_undone(
+    queue: ReviewQueue, out: Path, undone: str
+):
+    other = ReviewQueue([open_report(out)], reviewer="Bo")
+    for judge, view in zip((queue, other), queue.detail(0, 1)["views"], strict=False):
+        head, _, tail = view["keypoints"]
+        said = {"frame_index": view["frame"], "head": head, "tail": tail}
+        submit(judge, "correct", 1, **said)
+        if undone == "withdraw" and judge is queue:
+            submit(judge, "withdraw", 1)
+    with pytest.raises(UserError, match="Bo has moved points of fish 1 since"):
+        submit(queue, "undo")
+    submit(other, "undo")
+    submit(queue, "undo")
+    assert verify(out)[0] == []
+
+
 def test_undo_takes_edits_back_one_by_one(queue: ReviewQueue, out: Path):
     submit(queue, "split", 1, frame_index=3)
     submit(queue, "accept", 3)

@@ -1,17 +1,20 @@
 """The trip in a report: hauls with their effort, and a map without network."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 from stream_dmr.pipeline.haul_log import write_haul
+from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.store.trip import VesselTrack, Whereabouts
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.report_page import trip_section
 from stream_dmr.web.trip_map import draw_map
 from tests.export.test_agency_tables import HALIBUT
 from tests.store.test_vessel_track import kept
-from tests.support.fish_run import measure
+from tests.support.fish_run import measure, request
+from tests.support.tiny_clip import write_clip
 
 
 def test_a_map_has_each_fish_with_a_place_and_each_piece_of_the_track():
@@ -56,3 +59,16 @@ def test_hauls_and_vessel_stand_in_the_page(tmp_path: Path):
     page = tmp_path / "report.html"
     write_report([report], page, title="trip")
     assert section in page.read_text(encoding="utf-8")
+
+
+def test_a_haul_without_fish_is_in_the_page_with_its_effort(tmp_path: Path):
+    write_clip(tmp_path / "clip", fish=[[]] * 6)
+    asked = request(
+        tmp_path / "clip", tmp_path / "out", vessel="Sea Bird", start_utc="2026-11-22T06:00:00Z"
+    )
+    measure_source(asked, stop=threading.Event())
+    write_haul(asked.out, "start", name="north", at="0", said_by="Ada")
+    section = trip_section([open_report(asked.out)])
+    assert "Sea Bird" in section
+    assert ">north</td>" in section
+    assert "2026-11-22 06:00" in section
