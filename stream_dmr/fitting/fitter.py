@@ -4,7 +4,7 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import frame_from_crop
@@ -35,6 +35,7 @@ from stream_dmr.fitting.uncertainty import (
     shape_std_ratio,
     slant_std_ratio,
 )
+from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.reasons import Reason
 from stream_dmr.template.template import Template
@@ -42,6 +43,12 @@ from stream_dmr.template.template import Template
 # L_rec that a cold fit must gain to replace the pose of the frame before, and with it the end at
 # which the head is. Chosen by trial.
 _CLEAR_GAIN = 0.01
+# Of the length: how far a still's mask goes on beyond the tail until the tail is taken to be where
+# the mask ends, from where on that is something else, and std of the length over that way. Chosen
+# on photographs; see docs/research/real-pictures.md.
+_TAIL_BEYOND, _NO_TAIL, _TAIL_STD = 0.025, 0.08, 0.5
+_LAST_PART = 0.75  # of the midline's points: from there on it shows where the tail points
+_RAY_STEP_PX = 0.25
 
 
 class Solved(NamedTuple):
@@ -218,6 +225,15 @@ class Fitter:
             spread = covariance(problem, self._settings, parameters, rendering)
             if size_std is None:
                 size_std = length_std_ratio(problem, parameters, points, spread)
+        # Films' masks are too coarse for that; a still's was found in a longer box as well.
+        if crop.quality.length_doubt is not None:
+            beyond = beyond_tail(crop.mask, project(points[v + 3 :], target.anchor, target.K))
+            size_std = float(np.hypot(size_std, _TAIL_STD * beyond))
+            if _TAIL_BEYOND < beyond < _NO_TAIL:
+                midline = points[v + 3 :]
+                way = beyond * arc_length(midline) * _end_direction(midline)
+                points = points.copy()
+                points[[v + 2, -1]] += way
         placed = points + target.anchor
         keypoints_px = project(points[v : v + 3], target.anchor, target.K)
         return FittedShape(
@@ -265,6 +281,26 @@ class Fitter:
 
     def _problem(self, body: Body, target: Target) -> Problem:
         return Problem.from_settings(self._settings, body, target, with_smoothness=True)
+
+
+def beyond_tail(mask: Bool[np.ndarray, "S S"], midline_px: Float[np.ndarray, "M 2"]) -> float:
+    """How far a mask goes on beyond the tail, straight on, over the body's length; at most 1.
+
+    The rounded tail of a flounder ends behind a mesh whose tail is straight or forked.
+    """
+    length_px = arc_length(midline_px)
+    steps_px = np.arange(0, length_px, _RAY_STEP_PX)[:, None]
+    columns, rows = np.round(midline_px[-1] + steps_px * _end_direction(midline_px)).astype(int).T
+    inside = (rows >= 0) & (rows < len(mask)) & (columns >= 0) & (columns < len(mask))
+    inside[inside] = mask[rows[inside], columns[inside]]
+    end = len(inside) if inside.all() else int(np.argmin(inside))
+    return min(end * _RAY_STEP_PX / max(length_px, _RAY_STEP_PX), 1.0)
+
+
+def _end_direction(midline: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "D"]:
+    """Where a midline points at the tail, of length 1."""
+    along = midline[-1] - midline[int(_LAST_PART * len(midline))]
+    return along / max(float(np.linalg.norm(along)), 1e-9)
 
 
 def _is_finite(solution: Solution) -> bool:

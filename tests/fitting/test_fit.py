@@ -1,12 +1,15 @@
 from dataclasses import asdict, fields, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.fitter import Fitter, beyond_tail
 from stream_dmr.fitting.paper.adam import Objective
 from stream_dmr.fitting.paper.torch_body import DEFORMATIONS, Rig, deform
 from stream_dmr.fitting.target import Target
@@ -69,6 +72,43 @@ def assert_finite(shape):
             continue
         numbers = list(asdict(value).values()) if field.name == "losses" else value
         assert np.isfinite(numbers).all(), field.name
+
+
+@given(
+    st.floats(-np.pi, np.pi), st.floats(0.0, 0.3), st.floats(30.0, 60.0), st.sampled_from([1, 2, 4])
+)
+def test_how_far_a_mask_goes_on_beyond_the_tail(turn, share, length_px, radius):
+    along = np.array([np.cos(turn), np.sin(turn)])
+    midline = 64 + np.linspace(-0.5, 0.5, 20)[:, None] * length_px * along
+    mask = np.zeros((128, 128), np.uint8)
+    ends = midline[0], midline[-1] + share * length_px * along
+    cv2.line(mask, *(np.round(end).astype(int).tolist() for end in ends), 1, 2 * radius + 1)
+    beyond = beyond_tail(mask > 0, midline)
+    assert beyond == pytest.approx(share + radius / length_px, abs=2.5 / length_px)
+    assert beyond_tail(np.zeros_like(mask) > 0, midline) == 0
+    assert beyond_tail(np.ones_like(mask) > 0, midline) <= 1
+
+
+@pytest.mark.parametrize(("added", "is_moved"), [(0.0, False), (0.02, True), (0.1, False)])
+def test_a_still_s_tail_is_where_its_mask_ends_unless_that_is_far_away(added, is_moved):
+    crop = crop_of(true_pose(0), RIG, size=96)
+    camera, mask = crop.crop_camera, crop.mask.astype(np.uint8)
+    keypoints_px = crop_from_frame(
+        true_keypoints_px(true_pose(0), RIG, crop), crop_camera=camera, frame_camera=FRAME_CAMERA
+    )
+    tail, along = keypoints_px[2], keypoints_px[2] - keypoints_px[0]
+    line = [np.round(end).astype(int).tolist() for end in (tail, tail + added * along)]
+    if added > 0:
+        cv2.line(mask, *line, 1, 3)
+    film = replace(crop, mask=mask > 0)
+    still = replace(film, quality=replace(film.quality, length_doubt=0.0))
+    fitter, warm = Fitter(TEMPLATE, FitMeshSettings()), near(true_pose(0))
+    before, after = (fitter.fit(one, warm).mesh.shape for one in (film, still))
+    beyond = beyond_tail(film.mask, camera.project(before.midline))
+    longer = arc_length(after.midline) / arc_length(before.midline) - 1
+    assert longer == pytest.approx(beyond if is_moved else 0.0, abs=1e-3)
+    np.testing.assert_array_equal(after.midline[-1], after.keypoints[2])
+    assert after.length_std_ratio == pytest.approx(np.hypot(before.length_std_ratio, beyond / 2))
 
 
 @pytest.fixture(scope="module", params=SOLVERS)
