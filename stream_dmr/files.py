@@ -341,3 +341,17 @@ class ReservedSpace:
         """Release the space. Idempotent."""
         with suppress(OSError):
             self._path.unlink(missing_ok=True)
+
+
+# Cameras take these in the query, or in the path: /user=admin&password=...&channel=1.
+_SECRETS = re.compile(
+    r"(?<=[?&/;_])((?:user(?:name)?|usr|login|pass(?:word|wd)?|pwd|pw|token|auth|key)=)[^&\s'\"/;]*",
+    re.IGNORECASE,
+)
+
+
+def without_password(text: str) -> str:
+    """A text without the users, passwords and tokens of the addresses in it."""
+    if "://" not in text:
+        return text
+    return _SECRETS.sub(r"\1...", re.sub(r"(?<=://)[^/\s]*@", "", text))

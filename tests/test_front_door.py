@@ -12,6 +12,7 @@ import pytest
 
 import stream_dmr as sd
 from stream_dmr.api import read_rows
+from stream_dmr.errors import RecordingError
 from stream_dmr.pipeline.run_options import RunOptions, command_of
 from stream_dmr.store.run_tables import LENGTHS_COLUMNS
 from tests.support.command import invoke, rows
@@ -165,3 +166,8 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
     assert isinstance(names["strict"], sd.Run)
     assert [fish.status for fish in names["run"].fish] == ["measured"] * 4  # type: ignore[attr-defined]
+
+
+def test_no_recording_is_refused_in_one_line():
+    with pytest.raises(RecordingError, match="got none"):
+        sd.open([])

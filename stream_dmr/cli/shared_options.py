@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from stream_dmr.errors import UserError
-from stream_dmr.pipeline.run_options import without_password
+from stream_dmr.files import without_password
 from stream_dmr.recording.selection import Selection
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ import numpy as np
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.errors import ConfigError, UserError
+from stream_dmr.files import without_password
 from stream_dmr.fitting.shape.candidates import given_mesh, load_shapes
 from stream_dmr.networks.onnx_session import provider_notice
 from stream_dmr.nodes.read_frames import ReadFrames
@@ -21,7 +22,7 @@ from stream_dmr.pipeline.config import (
     stills,
     to_toml,
 )
-from stream_dmr.pipeline.run_options import RunOptions, without_password
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.pipeline.session import KeptCrops, KeptFrames, Setup
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
 from stream_dmr.segmentation.unet_segmenter import SHIPPED

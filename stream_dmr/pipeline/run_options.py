@@ -9,6 +9,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from stream_dmr.errors import UserError
+from stream_dmr.files import without_password
 from stream_dmr.recording.selection import EVERYTHING, Selection
 
 Stage = Literal["crop", "fit", "localize", "smooth"]
@@ -84,10 +85,6 @@ def default_out(source: str) -> Path:
         address = without_password(source).split("://", 1)[1]
         return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
     return Path("runs") / Path(source).resolve().stem
-
-
-def without_password(text: str) -> str:
-    return re.sub(r"(?<=://)[^/\s]*@", "", text)
 
 
 def command_of(request: RunOptions) -> RunOptions:

@@ -64,6 +64,8 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
     Raises RecordingError if one can't be read, or if they are not of the same run.
     """
     files = [file for path in paths for file in files_of(path)]
+    if not files:
+        raise RecordingError("expected a recording, or the folder of a run, got none")
     for file in files:
         if file.exists() and not file.is_file():
             raise RecordingError(f"{file}: expected a recording, got a pipe or a device")

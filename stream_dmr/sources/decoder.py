@@ -58,6 +58,8 @@ class Decoder:
         self.width = self.height = 0  # px, known after the first picture, as are these:
         self.fps = 0.0  # of the container; 0, NaN or impossible if it has none
         self.promised = 0.0  # number of frames, likewise
+        self.before_start = 0.0  # frames, by the container's clock, before the first picture
+        self.turned_deg = 0.0  # by which the container asks for a turn, which OpenCV has made
         self.num_errors = 0  # pictures, and the end, before which FFmpeg reported errors
         self._reading = Lock()
         self._shared: memoryview | None = None  # all slots
@@ -105,6 +107,8 @@ class Decoder:
             if "shape" in message:
                 self.height, self.width = message["shape"][:2]
                 self.fps, self.promised = message["fps"], message["promised"]
+                self.before_start = message["before_start"]
+                self.turned_deg = message["turned_deg"]
                 size = NUM_SLOTS * self.height * self.width * 3
                 self._shared = memoryview(mmap.mmap(self._memory, size))
             elif "resized" in message:

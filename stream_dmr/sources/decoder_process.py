@@ -20,14 +20,18 @@ import sys
 import threading
 from queue import SimpleQueue
 
-# FFmpeg reads its level once, at its first use in the process.
-os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "32"  # AV_LOG_INFO
+if __name__ == "__main__":  # and not in the process that only imports NUM_SLOTS
+    # FFmpeg reads its level once, at its first use in the process.
+    os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "40"  # AV_LOG_VERBOSE
 
 import cv2
 import numpy as np
 
 # A line of the levels "panic", "fatal" or "error", or H.264's note of concealment, an information.
 _ERRORS = re.compile(rb"FFMPEG:(00|08|16)\]|\bconcealing\b")
+
+# OpenCV scales pictures of another size to that of the first; H.264 and HEVC print such a change.
+_SIZES = re.compile(rb"\bReinit context to (\d+)x(\d+)")
 
 NUM_SLOTS = 8  # most of them hold pictures in use
 
@@ -57,6 +61,8 @@ def main(address: str, memory: int) -> None:
         shape=image.shape,
         fps=capture.get(cv2.CAP_PROP_FPS),
         promised=capture.get(cv2.CAP_PROP_FRAME_COUNT),
+        before_start=max(0.0, capture.get(cv2.CAP_PROP_PTS)),
+        turned_deg=capture.get(cv2.CAP_PROP_ORIENTATION_META),
     )
     slot = free.get()
     np.copyto(slots[slot], image)
@@ -70,7 +76,10 @@ def main(address: str, memory: int) -> None:
             return _send(lines, resized=image.shape)
         if not np.shares_memory(image, slots[slot]):
             np.copyto(slots[slot], image)
-        _send(lines, slot=slot, **_facts(capture, printed))
+        facts = _facts(capture, printed)
+        if printed.resized is not None:
+            return _send(lines, resized=printed.resized)
+        _send(lines, slot=slot, **facts)
     return _send(lines, end=True, has_errors=printed.has_errors())
 
 
@@ -81,6 +90,8 @@ class _Printed:
         self._file = os.memfd_create("printed")
         os.dup2(self._file, 1)
         self._flush = ctypes.CDLL(None).fflush
+        self._size: tuple[int, int] | None = None  # width and height, px, as they are coded
+        self.resized: tuple[int, int] | None = None  # height and width that came instead
 
     def has_errors(self) -> bool:
         """True if errors were printed since the last call."""
@@ -91,6 +102,11 @@ class _Printed:
         text = os.pread(self._file, num_bytes, 0)
         os.lseek(self._file, 0, os.SEEK_SET)
         os.ftruncate(self._file, 0)
+        for found in _SIZES.finditer(text):
+            size = int(found[1]), int(found[2])
+            if self._size is not None and size != self._size:
+                self.resized = size[1], size[0]
+            self._size = size
         return _ERRORS.search(text) is not None
 
 

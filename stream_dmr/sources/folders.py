@@ -242,7 +242,7 @@ class ClipFolder(Source):
             start_ns = 0 if state is None else state.modified_ns - round(duration_s * 1e9)
             next_ns = last_ns + round(1e9 / self._video.fps)
             done = self._frames_done.get(path.name, 0)
-            for frame in self._video:
+            for frame in self._whole_frames(self._video):
                 frame_index += 1
                 if frame.frame_index == done + 1:  # frames read before may lie before the last time
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
@@ -253,6 +253,14 @@ class ClipFolder(Source):
             for line in self._video.warnings:
                 self._on_notice(line)
             self.is_cut_off = self._video.is_cut_off  # of the last clip, which ends the frames
+
+    def _whole_frames(self, video: VideoFile) -> Iterator[Frame]:
+        """The frames of a clip up to the first of another size."""
+        try:
+            yield from video
+        except SourceError as error:
+            video.close()
+            self._on_notice(f"{error}; the rest of the clip was left out")
 
     def close(self) -> None:
         """Release the clip; the iteration ends."""

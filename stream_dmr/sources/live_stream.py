@@ -5,7 +5,6 @@ the stream's own timestamps, which space frames exactly but may jump or begin ag
 """
 
 import random
-import re
 import threading
 import time
 from collections import deque
@@ -13,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from stream_dmr.errors import SourceError
+from stream_dmr.files import without_password
 from stream_dmr.messages import Frame
 from stream_dmr.sources.decoder import DecodedPicture, Decoder, DecodingError
 from stream_dmr.sources.source import CameraCounts, ReadFramesSettings, ResumePoint, Source
@@ -91,7 +91,7 @@ class LiveStream(Source):
         """Raises SourceError if no picture comes for `connect_s`."""
         is_camera = address.isdecimal()
         # Names are recorded, so user and password are cut out of addresses.
-        self.name = f"camera {address}" if is_camera else re.sub(r"(?<=://)[^/]*@", "", address)
+        self.name = f"camera {address}" if is_camera else without_password(address)
         self.warnings: list[str] = []
         self._counts = CameraCounts()
         self._address = address

@@ -47,8 +47,17 @@ class VideoFile(Source):
             self._decoder.close()
             raise SourceError(f"{path}: {_unreadable_reason(path, start)}")
         self.height, self.width = self._decoder.height, self._decoder.width
-        self.num_frames = promised_frames(self._decoder.promised)
+        promised = self._decoder.promised
+        if self._is_matroska:  # its duration, of which OpenCV computes the number, begins at zero
+            promised -= min(self._decoder.before_start, promised - 1)
+        self.num_frames = promised_frames(promised)
         self.fps = plausible_fps(self._decoder.fps, settings)
+        if self._decoder.turned_deg % 360 and settings.orientation == "sensor":
+            self.warnings.append(
+                f"{path.name}: the file asks to be turned by {self._decoder.turned_deg:g} degrees, "
+                "and is measured so; a calibration of pictures that were not turned so gives wrong "
+                "lengths"
+            )
 
     def __iter__(self) -> Iterator[Frame]:
         """Raises SourceError at a frame of another size."""

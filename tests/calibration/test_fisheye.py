@@ -255,3 +255,16 @@ def test_the_file_of_a_pinhole_is_what_it_was(tmp_path):
     save_calibration(tmp_path / "c.yaml", Calibration(camera=LENS, plane=plane))
     assert "distortion_model" not in (tmp_path / "c.yaml").read_text()
     assert not decode(Camera, encode(LENS)).is_fisheye
+
+
+@pytest.mark.parametrize("width_deg", [90.0, 130.0, 165.0, 175.0, 190.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_lenses_of_any_width_are_found(width_deg, seed):
+    lens, rng = dome(width_deg=width_deg), np.random.default_rng(seed)
+    seen = {
+        Path(f"{k}.png"): corners_of(lens, pose, rng.normal(0, 0.1, (54, 2)))
+        for k, pose in enumerate(poses(14, seed=seed))
+    }
+    fit = fit_lens(seen, (WIDTH, HEIGHT), is_fisheye=True)
+    assert fit.rms_px < 0.2
+    np.testing.assert_allclose(np.diag(fit.camera.K)[:2], np.diag(lens.K)[:2], rtol=0.02)

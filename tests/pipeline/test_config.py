@@ -135,3 +135,11 @@ def test_a_file_of_other_bytes_a_folder_and_a_missing_file_are_refused(tmp_path:
     for path in (tmp_path / "binary", tmp_path, tmp_path / "none.toml"):
         with pytest.raises(ConfigError, match="expected"):
             load_config(path)
+
+
+@pytest.mark.parametrize("text", ["two\nlines", "a\ttab", "\x7f", "\x00", 'é"\\'])
+def test_any_text_survives_the_way_through_toml(text):
+    escaped = "".join(f"\\U{ord(character):08x}" for character in text)
+    config = parse_config(f'[fisheries]\nweight_source = "{escaped}"\n', where="x")
+    assert config.fisheries.weight_source == text
+    assert parse_config(to_toml(config), where="y") == config

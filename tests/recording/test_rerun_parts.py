@@ -1,5 +1,7 @@
 """The .rrd and what it is drawn from, part by part."""
 
+import subprocess
+import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -147,3 +149,13 @@ def test_an_rrd_is_not_begun_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(OutputError, match="room to write to, got: No space left"):
         RrdSink(tmp_path / "a.rrd", header(), SETTINGS)
     assert not (tmp_path / "a.rrd").exists()
+
+
+def test_a_script_without_a_guard_reads_an_rrd(rrd, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import stream_dmr as sd\nprint(len(list(sd.open({str(rrd)!r}, [sd.LengthEstimate]))))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert int(done.stdout) > 0

@@ -16,6 +16,7 @@ from stream_dmr.messages import Frame
 from stream_dmr.sources.folders import ClipFolder
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings, ResumePoint
+from tests.support.sources import h264
 
 AT_ONCE = ReadFramesSettings(clips_wait_s=0.0)
 OLD_S = 1_700_000_000
@@ -202,3 +203,23 @@ def test_a_last_clip_that_is_cut_off_is_said(tmp_path: Path, cut: str, is_cut_of
     assert 20 < len(list(folder)) < 40
     assert folder.is_cut_off == is_cut_off
     assert any("damaged" in line for line in folder.warnings)
+
+
+def test_a_clip_whose_clock_began_before_it_ends_when_it_was_written(tmp_path):
+    path = h264(tmp_path / "7.mkv", first_ms=3_600_000)  # as `ffmpeg -f segment` numbers on
+    os.utime(path, (OLD_S, OLD_S))
+    times = [frame.timestamp_ns for frame in open_source(str(tmp_path), AT_ONCE)]
+    assert times[0] / 1e9 == pytest.approx(OLD_S - 0.4, abs=0.1)
+
+
+def test_pictures_of_another_size_are_not_squeezed_into_that_of_the_first(tmp_path):
+    small, broad = h264(tmp_path / "s.ts"), h264(tmp_path / "b.ts", size=(160, 48))
+    joined = small.read_bytes() + broad.read_bytes()
+    broad.unlink()
+    (tmp_path / "t.ts").write_bytes(joined)
+    h264(tmp_path / "u.ts")
+    folder = open_source(str(tmp_path), AT_ONCE)
+    frames = list(folder)
+    assert {frame.source for frame in frames} == {"s.ts", "t.ts", "u.ts"}
+    assert sum(frame.source == "t.ts" for frame in frames) <= 10
+    assert any("160x48 px" in line for line in folder.warnings)

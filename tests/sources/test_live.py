@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.errors import SourceError
+from stream_dmr.files import without_password
 from stream_dmr.messages import Frame
 from stream_dmr.sources.decoder import Decoder, DecodingError, decoding_ahead
 from stream_dmr.sources.decoder_process import NUM_SLOTS
@@ -256,3 +257,20 @@ def test_a_decoder_that_nobody_takes_over_is_ended(tmp_path: Path):
     with decoding_ahead(path):
         assert len(children() - before) == 1
     assert children() == before
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "rtsp://mate:geheim@10.0.0.7/s1",
+        "rtsp://10.0.0.7/user=mate&password=geheim&channel=1",
+        "rtsp://10.0.0.7/user=mate_password=geheim_channel=1",
+        "http://10.0.0.7/video.cgi?user=mate&pwd=geheim",
+        "https://10.0.0.7/v.m3u8?token=geheim",
+    ],
+)
+def test_no_password_is_left_in_an_address(address):
+    shown = without_password(f"stream-dmr run --source '{address}' --out user=x")
+    assert "geheim" not in shown
+    assert shown.startswith("stream-dmr run --source 'rtsp" if "rtsp" in address else "stream-dmr")
+    assert shown.endswith("' --out user=x")

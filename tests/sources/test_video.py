@@ -1,4 +1,7 @@
 import itertools
+import struct
+import subprocess
+import sys
 import wave
 from collections import deque
 from fractions import Fraction
@@ -12,9 +15,9 @@ from hypothesis import strategies as st
 
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.source import nominal_ns
+from stream_dmr.sources.source import ReadFramesSettings, nominal_ns
 from stream_dmr.sources.video_file import VideoFile, container_ns
-from tests.support.sources import SETTINGS, noise, read, refusal
+from tests.support.sources import SETTINGS, h264, noise, read, refusal
 
 SECOND_NS = 10**9
 
@@ -216,3 +219,31 @@ def test_a_real_clip_is_read_whole(real):
     assert len(frames) == opened.num_frames == 668
     assert opened.warnings == []
     assert all(a.timestamp_ns < b.timestamp_ns for a, b in itertools.pairwise(frames))
+
+
+def test_a_matroska_whose_clock_began_before_it_is_whole(tmp_path):
+    opened, frames = read(h264(tmp_path / "a.mkv", first_ms=3_600_000))
+    assert (opened.num_frames, len(frames), opened.warnings) == (10, 10, [])
+    assert not opened.is_cut_off
+
+
+def test_a_video_that_asks_to_be_turned_is_named_if_there_is_a_calibration(tmp_path):
+    path = h264(tmp_path / "a.mp4")
+    data = bytearray(path.read_bytes())
+    start = data.find(b"tkhd") + 44  # the matrix of a track of version 0
+    one = 1 << 16
+    matrix = [-one, 0, 0, 0, -one, 0, 64 * one, 48 * one, 1 << 30]
+    data[start : start + 36] = struct.pack(">9i", *matrix)
+    path.write_bytes(data)
+    opened = open_source(str(path), ReadFramesSettings(orientation="sensor"))
+    (line,) = opened.warnings
+    assert "turned by 180 degrees" in line
+    opened.close()
+    opened, _ = read(path)
+    assert opened.warnings == []
+
+
+def test_ffmpeg_is_told_to_be_quiet_in_this_process():
+    code = "import os, stream_dmr.sources.video_file; print(os.environ['OPENCV_FFMPEG_LOGLEVEL'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "-8"

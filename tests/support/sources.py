@@ -1,5 +1,9 @@
 """Noise as pictures, and sources read whole, as the tests of sources share them."""
 
+from fractions import Fraction
+from pathlib import Path
+
+import av
 import numpy as np
 import pytest
 
@@ -26,3 +30,18 @@ def refusal(source):
         read(source)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def h264(path: Path, *, size=(64, 48), num_frames=10, first_ms=0) -> Path:
+    """Noise at 25 frames a second, the first at a time of the container's clock."""
+    kind = {".mkv": "matroska", ".ts": "mpegts"}.get(path.suffix)
+    with av.open(str(path), "w", format=kind) as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
+        for seed in range(num_frames):
+            frame = av.VideoFrame.from_ndarray(noise(seed, size=size), format="bgr24")
+            frame.pts, frame.time_base = first_ms + 40 * seed, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path

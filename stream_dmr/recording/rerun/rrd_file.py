@@ -5,15 +5,15 @@ messages of each type are numbered, and a last row has their number.
 """
 
 import json
+import os
+import pickle
 import subprocess
+import sys
 import warnings
 import zlib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from heapq import merge
 from importlib.resources import files
-from multiprocessing import get_context
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -117,15 +117,41 @@ class RrdRecording:
             raise RecordingError(f"{self.path}: lacks {error}, not a complete recording") from error
 
 
+_READ = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from stream_dmr.recording.rerun.rrd_file import send_rows; send_rows(sys.argv[1])"
+)
+
+
 def _read_apart(path: Path) -> Rows:
-    """Read in a process of its own: on some damaged files Rerun's reader crashes its process."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        try:
-            return pool.submit(_read, path).result()
-        except BrokenProcessPool as error:
-            raise RecordingError(
-                f"{path}: damaged: Rerun's reader crashes on it; replay the .mcap instead"
-            ) from error
+    """Read in a process of its own: on some damaged files Rerun's reader crashes its process.
+
+    `multiprocessing` would run a user's script, if that guards nothing by `__name__`, once more.
+    """
+    command = [sys.executable, "-P", "-c", _READ, str(path), *sys.path]
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    if done.returncode or not done.stdout:
+        raise RecordingError(
+            f"{path}: damaged: Rerun's reader crashes on it; replay the .mcap instead"
+        )
+    answer: Rows | RecordingError = pickle.loads(done.stdout)
+    if isinstance(answer, RecordingError):
+        raise answer
+    return answer
+
+
+def send_rows(path: str) -> None:
+    """Write the rows of a file, or the error, to the process that waits for them at stdout."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print
+    try:
+        answer: Rows | RecordingError = _read(Path(path))
+    except RecordingError as error:
+        answer = RecordingError(str(error))
+    with answers:
+        pickle.dump(answer, answers)
 
 
 def _read(path: Path) -> Rows:
