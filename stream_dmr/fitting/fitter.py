@@ -24,7 +24,7 @@ from stream_dmr.fitting.shape.space import (
 from stream_dmr.fitting.size import SizeScanner, nats_against
 from stream_dmr.fitting.solver.contour_solver import ContourSolver
 from stream_dmr.fitting.solver.descent import evaluate
-from stream_dmr.fitting.solver.outline import project
+from stream_dmr.fitting.solver.outline import COVERED, project
 from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.starts import cold_starts, recentered
 from stream_dmr.fitting.target import TOWARD_CAMERA, Solution, Solver, Target
@@ -43,9 +43,10 @@ from stream_dmr.template.template import Template
 # L_rec that a cold fit must gain to replace the pose of the frame before, and with it the end at
 # which the head is. Chosen by trial.
 _CLEAR_GAIN = 0.01
-# Of the length: how far a still's mask goes on beyond the tail until the tail is taken to be where
-# the mask ends, from where on that is something else, and std of the length over that way. Chosen
-# on photographs; see docs/research/real-pictures.md.
+# The rounded tail of a flounder ends behind a mesh whose tail is straight or forked. Of the length:
+# how far a still's mask goes on behind the mesh until the tail is taken to be where the mask ends,
+# from where on that is something else, and std of the length over that way. Films' masks are too
+# coarse. Chosen on photographs; see docs/research/real-pictures.md.
 _TAIL_BEYOND, _NO_TAIL, _TAIL_STD = 0.025, 0.08, 0.5
 _LAST_PART = 0.75  # of the midline's points: from there on it shows where the tail points
 _RAY_STEP_PX = 0.25
@@ -225,15 +226,17 @@ class Fitter:
             spread = covariance(problem, self._settings, parameters, rendering)
             if size_std is None:
                 size_std = length_std_ratio(problem, parameters, points, spread)
-        # Films' masks are too coarse for that; a still's was found in a longer box as well.
-        if crop.quality.length_doubt is not None:
-            beyond = beyond_tail(crop.mask, project(points[v + 3 :], target.anchor, target.K))
+        if crop.quality.length_doubt is not None:  # of a still, which was seen in a longer box
+            midline = points[v + 3 :]
+            midline_px = project(midline, target.anchor, target.K)
+            of_mask, of_mesh = (
+                beyond_tail(shown, midline_px) for shown in (crop.mask, rendering.covered > COVERED)
+            )
+            beyond = max(of_mask - of_mesh, 0.0)
             size_std = float(np.hypot(size_std, _TAIL_STD * beyond))
             if _TAIL_BEYOND < beyond < _NO_TAIL:
-                midline = points[v + 3 :]
-                way = beyond * arc_length(midline) * _end_direction(midline)
                 points = points.copy()
-                points[[v + 2, -1]] += way
+                points[[v + 2, -1]] += beyond * arc_length(midline) * _end_direction(midline)
         placed = points + target.anchor
         keypoints_px = project(points[v : v + 3], target.anchor, target.K)
         return FittedShape(
@@ -284,10 +287,7 @@ class Fitter:
 
 
 def beyond_tail(mask: Bool[np.ndarray, "S S"], midline_px: Float[np.ndarray, "M 2"]) -> float:
-    """How far a mask goes on beyond the tail, straight on, over the body's length; at most 1.
-
-    The rounded tail of a flounder ends behind a mesh whose tail is straight or forked.
-    """
+    """How far a mask goes on beyond the tail, straight on, over the body's length; at most 1."""
     length_px = arc_length(midline_px)
     steps_px = np.arange(0, length_px, _RAY_STEP_PX)[:, None]
     columns, rows = np.round(midline_px[-1] + steps_px * _end_direction(midline_px)).astype(int).T
