@@ -40,7 +40,13 @@ from jaxtyping import Bool, Float
 from stream_dmr.errors import AnnotationError
 from stream_dmr.files import natural_order, read_text
 from stream_dmr.pictures import pictures_in
-from stream_dmr.segmentation.mask_outlines import Ring, decode_coco, fill_parts, ring_of
+from stream_dmr.segmentation.mask_outlines import (
+    Ring,
+    decode_coco,
+    fill_parts,
+    require_size,
+    ring_of,
+)
 
 UNKNOWN_ID = 0  # `track_id` of a box whose file does not follow fish from frame to frame
 
@@ -60,9 +66,12 @@ class AnnotatedBox:
     species: str = ""
     ends_px: Float[np.ndarray, "2 2"] | None = None
     is_relative: bool = False  # of YOLO: the box is in shares of the frame's width and height
+    check_size: Callable[[tuple[int, int]], None] | None = None  # as `mask`, of COCO
 
     def in_px(self, width: int, height: int) -> "AnnotatedBox":
-        """The box in a frame of a size."""
+        """The box in a frame of a size. AnnotationError if the file means pictures of another."""
+        if self.check_size is not None:
+            self.check_size((height, width))
         if not self.is_relative:
             return self
         box = self.bbox_xyxy_px * [width, height, width, height]
@@ -209,14 +218,16 @@ def parse_coco(
     """
     try:
         table = json.loads(text)
-        names = {int(image["id"]): str(image["file_name"]) for image in table["images"]}
+        images = {int(image["id"]): image for image in table["images"]}
+        names = {number: str(image["file_name"]) for number, image in images.items()}
         annotations = list(table["annotations"])
     except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE) as error:
         raise AnnotationError(
             f'{path}: expected COCO\'s JSON with "images" (id, file_name) and "annotations", '
             f"got: {type(error).__name__} {error}"
         ) from None
-    return group_by_frame(_annotation_boxes(annotations, _frames_of(names, pictures, path), path))
+    frames = _frames_of(names, pictures, path)
+    return group_by_frame(_annotation_boxes(annotations, images, frames, path))
 
 
 def _frames_of(names: dict[int, str], pictures: Sequence[Path], path: Path) -> dict[int, int]:
@@ -237,12 +248,13 @@ def _frames_of(names: dict[int, str], pictures: Sequence[Path], path: Path) -> d
 
 
 def _annotation_boxes(
-    annotations: list[Any], frames: dict[int, int], path: Path
+    annotations: list[Any], images: dict[int, Any], frames: dict[int, int], path: Path
 ) -> Iterator[tuple[str, int, AnnotatedBox]]:
     for number, annotation in enumerate(annotations, start=1):
         where = f"{path}, annotation {number}"
         try:
-            frame_index = frames[int(annotation["image_id"])]
+            image_id = int(annotation["image_id"])
+            frame_index = frames[image_id]
             x, y, width, height = (float(value) for value in annotation["bbox"])
             track_id, drawn = _track_id(annotation), annotation.get("segmentation")
             is_outline = bool(drawn) and (len(drawn) > 1 or len(drawn[0]) > _BOX_LENGTH)
@@ -258,6 +270,7 @@ def _annotation_boxes(
             visibility=1.0,
             score=score,
             mask=partial(decode_coco, segmentation=drawn, where=where) if is_outline else None,
+            check_size=partial(require_size, images[image_id], where=where),
         )
         yield where, frame_index, box
 

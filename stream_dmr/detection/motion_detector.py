@@ -196,8 +196,8 @@ _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
 # Share of foreign pixels from which on the background is learnt anew: after a black picture, a lamp
 # that is switched on or another shot it would take hundreds of pictures.
 _ANOTHER_SCENE = 0.5
-# Most levels by which an encoder changes a picture that it repeats; from one to the next of 20 films
-# the largest change of a pixel was 10 and more. See docs/research/tracking.md.
+# Most levels by which an encoder changes a picture that it repeats; from one to the next of 20
+# films the largest change of a pixel was 10 and more. See docs/research/tracking.md.
 _REPEATED, _MOST_REPEATS = 6.0, 3  # and how often in a row, until the scene is at rest
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
 # By the levels of a mask of moving pixels: errors of the model must fade there at last.

@@ -147,11 +147,18 @@ def used_columns(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
-    """A line if weight or legal size are asked for, and no fish is of their species."""
+    """A line if weight or legal size are asked for, and no fish has them."""
     species = sorted({record["species"] for record in records if record["length_mm"] is not None})
     is_asked = settings.weight_a > 0 or settings.legal_cm > 0
-    if not is_asked or not species or any(is_same_species(s, settings.species) for s in species):
+    if not is_asked or not species:
         return []
+    if any(is_same_species(s, settings.species) for s in species):
+        if any(r["weight_kg"] is not None or r["is_legal_size"] is not None for r in records):
+            return []
+        return [
+            "[fisheries]: no weight and no legal size, since the mesh does not say whether its "
+            "lengths are fork or total lengths; add [length] to its TOML"
+        ]
     return [
         f"[fisheries] species: no fish is '{settings.species}' (column species: "
         f"{', '.join(species)}), so none has a weight or a legal size; set [fisheries] to the "

@@ -20,7 +20,7 @@ from stream_dmr.store.trip import END, START, Haul, haul_at, haul_values, hauls_
 
 _RULE = "rule"
 _FAST_NS = 60_000_000_000  # time that the vessel must be fast; chosen
-_WATCHED_NS = 300_000_000_000  # longest time in a row of `watched`
+_WATCHED_NS = 60_000_000_000  # longest time in a row of `watched`: a crash loses the last row
 _PAUSE_NS = 10_000_000_000  # between two frames; a longer pause ends a row of `watched`
 
 

@@ -3,7 +3,7 @@
 Their coordinates are from the corner of the picture, so a pixel's centre is at one half.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -121,6 +121,19 @@ def decode_coco(
     raise AnnotationError(
         f"{where}: expected a mask of {shape[1]}x{shape[0]} px, got one of another size"
     )
+
+
+def require_size(image: Mapping[str, Any], shape: tuple[int, int], *, where: str) -> None:
+    """Raise AnnotationError if COCO's `image` says another size than the picture's shape.
+
+    Its boxes and polygons are then of another scale, or of a picture that was turned.
+    """
+    said = image.get("width"), image.get("height")
+    if all(isinstance(n, int | float) and n > 0 for n in said) and said != (shape[1], shape[0]):
+        raise AnnotationError(
+            f"{where}: expected annotations of a picture of {shape[1]}x{shape[0]} px, got those of "
+            f"{said[0]}x{said[1]} px; annotate the pictures as they are"
+        )
 
 
 def _unpack(text: str) -> list[int]:

@@ -32,7 +32,7 @@ def read_effort(
 ) -> list[HaulEffort]:
     """The effort of each haul of a folder, and of the time between them. Raises OutputError.
 
-    `span`: only the watched time in this span, to the five minutes of a row.
+    `span`: only the watched time in this span, to the minute of a row.
     """
     hauls = hauls_of(read_rows(database, HAULS))
     rows = read_rows(database, WATCHED)

@@ -1,6 +1,7 @@
 """Training examples from a user's own pictures, masks, and marks of head and tail."""
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from stream_dmr.files import read_text
 from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import box_coverage
 from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size_if_huge
-from stream_dmr.segmentation.mask_outlines import decode_coco
+from stream_dmr.segmentation.mask_outlines import decode_coco, require_size
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX, FishPatch
 from stream_dmr.training.samples import (
@@ -113,6 +114,14 @@ def _ids(labels: Integer[np.ndarray, "H W"]) -> Integer[np.ndarray, "H W"]:
 
 def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
     pictures, annotations = _parse_coco(file)
+    names = [Path(str(picture["file_name"])).name for picture in pictures]
+    for what, values in (("id", [str(p["id"]) for p in pictures]), ("name", names)):
+        again = [value for value, count in Counter(values).items() if count > 1]
+        if again:
+            raise AnnotationError(
+                f"{file}: expected images each with a {what} of its own, got {again[0]} more than "
+                "once: masks of one would be laid on the other; rename them"
+            )
     for picture in pictures:
         name = Path(str(picture["file_name"])).name
         of_it = [fish for fish in annotations if fish.get("image_id") == picture["id"]]
@@ -122,6 +131,7 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
         if name not in paths:
             raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
         image = read_image(paths[name])
+        require_size(picture, image.shape[:2], where=f"{file}, image {name}")
         masks = [
             decode_coco(
                 image.shape[:2], fish["segmentation"], where=f"{file}, annotation {fish.get('id')}"

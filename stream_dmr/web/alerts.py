@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
+from http.client import HTTPException
 from pathlib import Path
+from typing import Any
 
 from stream_dmr.errors import ConfigError, reason_of, requires_extra
 from stream_dmr.files import read_secret
@@ -54,6 +56,8 @@ class AlertSender:
     ) -> None:
         """Raises ConfigError if the settings do not fit together."""
         self._deliver = _deliveries(settings)
+        # The kinds of problems in the last alert that each address took.
+        self._told = dict[Callable[[Alert], None], list[str]]((d, []) for d in self._deliver)
         self._failing = set[Callable[[Alert], None]]()
         self._run, self._problems, self._on_notice = run, problems, on_notice
         self._look_s, self._first_pause_s = look_s, first_pause_s
@@ -67,38 +71,40 @@ class AlertSender:
         self._thread.join(_TIMEOUT_S)
 
     def _watch(self) -> None:
-        sent: list[str] = []  # the kinds of problems in the last alert
         seen, num_equal = list[str](), 0
         while not self._ended.wait(self._look_s):
             problems = list(self._problems())
             kinds = _kinds(problems)
             num_equal, seen = (num_equal + 1 if kinds == seen else 1), kinds
-            if kinds != sent and num_equal >= _SETTLE_LOOKS and self._send(problems):
-                sent = kinds
+            if num_equal >= _SETTLE_LOOKS and any(self._told[d] != kinds for d in self._deliver):
+                self._send(problems)
 
-    def _send(self, problems: Sequence[str]) -> bool:
-        """Send an alert to all addresses; False if the health changes or the run ends before."""
+    def _send(self, problems: Sequence[str]) -> None:
+        """Send an alert to the addresses that know another state.
+
+        Ends before if the health changes or the run ends.
+        """
         alert = Alert(
             run=self._run,
             healthy=not problems,
             problems=problems,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
         )
-        waiting, pause_s = list(self._deliver), self._first_pause_s
+        kinds, pause_s = _kinds(problems), self._first_pause_s
         while True:
-            waiting = [deliver for deliver in waiting if not self._try(deliver, alert)]
-            if not waiting:
-                return True
-            if self._ended.wait(pause_s):
-                return False
+            for deliver in self._deliver:
+                if self._told[deliver] != kinds and self._try(deliver, alert):
+                    self._told[deliver] = kinds
+            if all(told == kinds for told in self._told.values()) or self._ended.wait(pause_s):
+                return
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-            if _kinds(self._problems()) != _kinds(problems):
-                return False
+            if _kinds(self._problems()) != kinds:
+                return
 
     def _try(self, deliver: Callable[[Alert], None], alert: Alert) -> bool:
         try:
             deliver(alert)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, HTTPException) as error:  # the last: an answer that is no HTTP
             if deliver not in self._failing:
                 line = f"[alerts] could not be sent, tried again later: {reason_of(error)}"
                 self._on_notice(line)
@@ -130,8 +136,18 @@ def _post(address: str, alert: Alert) -> None:
     """POST an alert as JSON; chat services show its `text`."""
     content = json.dumps(asdict(alert) | {"text": alert.title}).encode()
     request = urllib.request.Request(address, content, {"Content-Type": "application/json"})
-    with urllib.request.urlopen(request, timeout=_TIMEOUT_S):
+    with _OPENER.open(request, timeout=_TIMEOUT_S):
         pass
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Makes a redirect an error: urllib would GET the other address, without the alert."""
+
+    def redirect_request(self, *_: Any, **__: Any) -> None:
+        return None
+
+
+_OPENER = urllib.request.build_opener(_NoRedirects)
 
 
 def _services(file: str) -> Iterator[Callable[[Alert], None]]:

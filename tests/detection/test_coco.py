@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.detection.box_files import UNKNOWN_ID, parse_coco
+from stream_dmr.detection.box_files import UNKNOWN_ID, load_boxes, parse_coco
 from stream_dmr.errors import AnnotationError
 from tests.support.annotation_files import coco
 
@@ -45,3 +45,14 @@ def test_files_of_another_kind_are_refused(text: str, expected: str):
         parse_coco(text, PATH)
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_boxes_of_pictures_of_another_size_are_refused(tmp_path):
+    image = {"id": 1, "file_name": "000001.png", "width": 640, "height": 480}
+    box = {"id": 1, "image_id": 1, "bbox": [10, 20, 30, 40]}
+    path = tmp_path / "boxes.json"
+    path.write_text(json.dumps({"images": [image], "annotations": [box]}))
+    (given,) = load_boxes(path)[1]
+    given.in_px(640, 480)
+    with pytest.raises(AnnotationError, match="of 1280x960 px, got those of 640x480 px"):
+        given.in_px(1280, 960)

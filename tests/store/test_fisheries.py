@@ -16,7 +16,7 @@ from stream_dmr.errors import TemplateError
 from stream_dmr.evidence.seal import read_provenance
 from stream_dmr.export.agency_tables import template_of
 from stream_dmr.export.exporter import Export
-from stream_dmr.export.fish_table import FISH_TABLE
+from stream_dmr.export.fish_table import FISH_TABLE, unweighed_note
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.pipeline.config import Config, parse_config
 from stream_dmr.species import find_species, load_species
@@ -233,3 +233,11 @@ def test_settings_are_read_from_a_config():
     config = parse_config('[fisheries]\nspecies = "cod"\nweight_a = 1e-5\n', where="x")
     assert (config.fisheries.species, config.fisheries.weight_a) == ("cod", 1e-5)
     assert {field.name for field in fields(Derived)} <= FISH_TABLE.keys()
+
+
+def test_a_mesh_that_names_no_kind_of_length_is_said_to_give_no_weight():
+    record = {"species": "Pacific halibut", "length_mm": 800.0}
+    lacking = record | {"weight_kg": None, "is_legal_size": None}
+    (line,) = unweighed_note([lacking], FisheriesSettings())
+    assert "add [length] to its TOML" in line
+    assert unweighed_note([lacking | {"weight_kg": 6.0}], FisheriesSettings()) == []

@@ -147,3 +147,29 @@ def test_coco_files_of_another_kind_are_refused(vessel):
     assert "polygons or run lengths" in refusal(images, file)
     (images / "haul-0.png").unlink()
     assert "expected haul-0.png among the images" in refusal(images, file)
+
+
+def _change_images(path, change):
+    table = json.loads(path.read_text())
+    change(table["images"])
+    path.write_text(json.dumps(table))
+
+
+def test_polygons_of_pictures_of_another_size_are_refused(tmp_path):
+    file = _square(tmp_path, {"width": 128, "height": 96})
+    assert "of 64x48 px" in refusal(tmp_path / "images", file)
+
+
+def test_images_of_one_name_or_id_are_refused(tmp_path):
+    for second in ({"id": 2, "file_name": "other/a.png"}, {"id": 1, "file_name": "b.png"}):
+        assert "of its own" in refusal(tmp_path / "images", _square(tmp_path, {}, second))
+
+
+def _square(folder, said, *more):
+    (folder / "images").mkdir(exist_ok=True)
+    cv2.imwrite(str(folder / "images" / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    cv2.imwrite(str(folder / "images" / "b.png"), np.zeros((48, 64, 3), np.uint8))
+    square = {"id": 1, "image_id": 1, "segmentation": [[10, 10, 30, 10, 30, 20, 10, 20]]}
+    images = [{"id": 1, "file_name": "a.png"} | said, *more]
+    (folder / "masks.json").write_text(json.dumps({"images": images, "annotations": [square]}))
+    return folder / "masks.json"

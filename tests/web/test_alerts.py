@@ -5,7 +5,7 @@ import json
 import socket
 import ssl
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -32,6 +32,7 @@ class Webhook(HTTPServer):
     def __init__(self, num_refused: int = 0) -> None:
         self.received: Queue[dict[str, object]] = Queue()
         self.num_refused = num_refused
+        self.num_answers = 0
         super().__init__(("127.0.0.1", 0), _Handler)
 
     @property
@@ -294,3 +295,56 @@ def refusal(settings: AlertSettings) -> str:
         pass
     assert "secret" not in str(refused.value)
     return str(refused.value)
+
+
+class _Rude(BaseHTTPRequestHandler):
+    """Answers the first post with what is no HTTP, or a redirect; later ones as `_Handler`."""
+
+    server: Webhook
+    answers: Sequence[bytes] = ()
+
+    def do_POST(self) -> None:
+        content = self.rfile.read(int(self.headers["Content-Length"]))
+        if self.server.num_answers < len(self.answers):
+            self.wfile.write(self.answers[self.server.num_answers])
+            self.server.num_answers += 1
+            self.close_connection = True
+            return
+        self.server.received.put(json.loads(content))
+        self.send_response(200)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"this is no HTTP\r\n\r\n",
+        b"HTTP/1.0 301 Moved\r\nLocation: /elsewhere\r\nContent-Length: 0\r\n\r\n",
+    ],
+)
+def test_an_alert_that_a_strange_answer_swallows_is_sent_again(answer: bytes):
+    notices: list[str] = []
+    with serving(Webhook()) as webhook:
+        webhook.RequestHandlerClass = type("Rude", (_Rude,), {"answers": [answer]})
+        with watching(AlertSettings(webhook=webhook.address), ["no picture"], notices):
+            assert webhook.received.get(timeout=WAIT_S)["problems"] == ["no picture"]
+    assert len(notices) == 1
+
+
+def test_an_address_that_took_an_alert_is_told_the_end_though_another_failed(apprise_file):
+    problems, notices = ["no picture"], list[str]()
+    with serving(Webhook(num_refused=10**6)) as broken, serving(Webhook()) as works:
+        file = apprise_file(service_of(works)).apprise_file
+        settings = AlertSettings(webhook=broken.address, apprise_file=file)
+        with watching(settings, problems, notices):
+            assert "unhealthy" in str(works.received.get(timeout=WAIT_S))
+            problems.clear()
+            assert "healthy again" in str(works.received.get(timeout=WAIT_S))

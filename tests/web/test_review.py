@@ -360,3 +360,11 @@ def test_moved_points_are_in_the_report(judge: ReviewQueue, report: RunReport, o
     moved = json.dumps(row["moved"], separators=(",", ":"))
     assert f'"moved":{moved}' in text
     assert submit(judge, track_id=1, kind="withdraw")["moved"] == {}
+
+
+def test_a_key_that_is_held_judges_one_fish(tab: Tab, out: Path):
+    tab.run("choose(1); await settled();")
+    for is_held in (False, *[True] * 5):
+        tab.send("Input.dispatchKeyEvent", type="keyDown", key="a", text="a", autoRepeat=is_held)
+        tab.run("await settled();")
+    assert [(v.kind, v.track_id) for v in read_verdicts(out / "lengths.db")] == [("accept", 1)]

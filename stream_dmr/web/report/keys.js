@@ -14,6 +14,7 @@ const KEYS = [
   ["b", "add a missed fish: draw boxes, Enter", click("do-add")], ["p", "save moved points", click("do-correct")],
   ["?", "these keys", () => document.getElementById("keys").toggleAttribute("open")],
 ];
+const REPEATED = ["j", "k", "ArrowLeft", "ArrowRight", "<", ">"];
 const KEY_NAMES = { " ": "space", ArrowLeft: "\u2190", ArrowRight: "\u2192" };
 
 function drawKeys() {
@@ -31,5 +32,6 @@ function onKey(event) {
   const known = KEYS.find(([key]) => key === event.key || key === event.key.toLowerCase());
   if (!known || (event.key === " " && event.target.matches("button"))) return;
   event.preventDefault();
+  if (event.repeat && !REPEATED.includes(known[0])) return;  // a key that is held judges one fish
   known[2]();
 }
