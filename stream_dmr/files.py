@@ -345,7 +345,7 @@ class ReservedSpace:
 
 # Cameras take these in the query, or in the path: /user=admin&password=...&channel=1.
 _SECRETS = re.compile(
-    r"(?<=[?&/;_])((?:user(?:name)?|usr|login|pass(?:word|wd)?|pwd|pw|token|auth|key)=)[^&\s'\"/;]*",
+    r"(?<=[?&/;_])((?:user(?:name)?|usr|login|pass(?:word|wd)?|pwd|pw|secret|token|auth|sid|key)=)[^&\s'\"/;]*",
     re.IGNORECASE,
 )
 

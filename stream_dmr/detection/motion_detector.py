@@ -196,9 +196,10 @@ _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
 # Share of foreign pixels from which on the background is learnt anew: after a black picture, a lamp
 # that is switched on or another shot it would take hundreds of pictures.
 _ANOTHER_SCENE = 0.5
-# Most levels by which an encoder changes a picture that it repeats; from one to the next of 20
-# films the largest change of a pixel was 10 and more. See docs/research/tracking.md.
-_REPEATED, _MOST_REPEATS = 6.0, 3  # and how often in a row, until the scene is at rest
+# Most levels by which an encoder changes a picture that it repeats: between pictures of 20 films
+# the largest change was 10 and more, but in one of a pond at rest. See docs/research/tracking.md.
+_MAX_REPEAT_CHANGE = 6.0
+_MAX_REPEATS = 3  # consecutive ones; with more the scene is at rest
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
 # By the levels of a mask of moving pixels: errors of the model must fade there at last.
 _RATES = np.array([1] + [0.02] * 255, np.float32)
@@ -238,7 +239,7 @@ class MotionDetector:
         self._settings = settings
         self._camera = CameraMotion()
         self._background: BackgroundModel | None = None
-        self._repeats = 0  # of the last picture, in a row
+        self._repeats = 0  # of the last picture, consecutive
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # picture, and what moves in it
         self._before: UInt8[np.ndarray, "h w 3"] | None = None  # last picture, background's pixels
         self._is_foreign: Bool[np.ndarray, "h w"] | None = None  # in the last picture's pixels
@@ -270,10 +271,10 @@ class MotionDetector:
 
     def _moved_before(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"] | None:
         """What moved in the last picture if this one repeats it: its fish are not at rest."""
-        if self._last is None or self._repeats == _MOST_REPEATS:
+        if self._last is None or self._repeats == _MAX_REPEATS:
             return None
         picture, moving = self._last
-        if cv2.norm(small, picture, cv2.NORM_INF) > _REPEATED:
+        if cv2.norm(small, picture, cv2.NORM_INF) > _MAX_REPEAT_CHANGE:
             return None
         self._repeats += 1
         return moving

@@ -156,8 +156,9 @@ def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSetting
         if any(r["weight_kg"] is not None or r["is_legal_size"] is not None for r in records):
             return []
         return [
-            "[fisheries]: no weight and no legal size, since the mesh does not say whether its "
-            "lengths are fork or total lengths; add [length] to its TOML"
+            "[fisheries]: no weight and no legal size, since the lengths that they are for do not "
+            "follow from the mesh's; its TOML needs [length] tail, and total_per_fork if "
+            "[fisheries] asks for the other length"
         ]
     return [
         f"[fisheries] species: no fish is '{settings.species}' (column species: "

@@ -43,11 +43,11 @@ from stream_dmr.template.template import Template
 # L_rec that a cold fit must gain to replace the pose of the frame before, and with it the end at
 # which the head is. Chosen by trial.
 _CLEAR_GAIN = 0.01
-# The rounded tail of a flounder ends behind a mesh whose tail is straight or forked. Of the length:
-# how far a still's mask goes on behind the mesh until the tail is taken to be where the mask ends,
-# from where on that is something else, and std of the length over that way. Films' masks are too
-# coarse. Chosen on photographs; see docs/research/real-pictures.md.
-_TAIL_BEYOND, _NO_TAIL, _TAIL_STD = 0.025, 0.08, 0.5
+# The rounded tail of a flounder ends behind a mesh whose tail is straight or forked. How far a
+# still's mask goes on behind the mesh, over the length: the tail moves on by so much from the first
+# to the second, from where on it is something else; and the std of the length over that way. Films'
+# masks are too coarse. Chosen on photographs; see docs/research/real-pictures.md.
+_MIN_TAIL_GAP, _MAX_TAIL_GAP, _TAIL_GAP_STD = 0.025, 0.08, 0.5
 _LAST_PART = 0.75  # of the midline's points: from there on it shows where the tail points
 _RAY_STEP_PX = 0.25
 
@@ -226,15 +226,15 @@ class Fitter:
             spread = covariance(problem, self._settings, parameters, rendering)
             if size_std is None:
                 size_std = length_std_ratio(problem, parameters, points, spread)
-        if crop.quality.length_doubt is not None:  # of a still, which was seen in a longer box
+        if crop.quality.length_doubt is not None:  # only stills have one
             midline = points[v + 3 :]
             midline_px = project(midline, target.anchor, target.K)
             of_mask, of_mesh = (
                 beyond_tail(shown, midline_px) for shown in (crop.mask, rendering.covered > COVERED)
             )
             beyond = max(of_mask - of_mesh, 0.0)
-            size_std = float(np.hypot(size_std, _TAIL_STD * beyond))
-            if _TAIL_BEYOND < beyond < _NO_TAIL:
+            size_std = float(np.hypot(size_std, _TAIL_GAP_STD * beyond))
+            if _MIN_TAIL_GAP < beyond < _MAX_TAIL_GAP:
                 points = points.copy()
                 points[[v + 2, -1]] += beyond * arc_length(midline) * _end_direction(midline)
         placed = points + target.anchor
@@ -289,7 +289,9 @@ class Fitter:
 def beyond_tail(mask: Bool[np.ndarray, "S S"], midline_px: Float[np.ndarray, "M 2"]) -> float:
     """How far a mask goes on beyond the tail, straight on, over the body's length; at most 1."""
     length_px = arc_length(midline_px)
-    steps_px = np.arange(0, length_px, _RAY_STEP_PX)[:, None]
+    if not np.isfinite(length_px):
+        return 0.0
+    steps_px = np.arange(0, min(length_px, 2 * len(mask)), _RAY_STEP_PX)[:, None]
     columns, rows = np.round(midline_px[-1] + steps_px * _end_direction(midline_px)).astype(int).T
     inside = (rows >= 0) & (rows < len(mask)) & (columns >= 0) & (columns < len(mask))
     inside[inside] = mask[rows[inside], columns[inside]]

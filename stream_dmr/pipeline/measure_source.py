@@ -223,7 +223,8 @@ def _measured_again(
     A stop or an error leaves the first results as they are.
     """
     out = request.out
-    require_free_names(out, overwrite=request.overwrite)  # for their shape
+    # The learnt mesh must not replace a mesh of the user's.
+    require_free_names(out, overwrite=request.overwrite)
     with tempfile.TemporaryDirectory(prefix=".again-", dir=out) as folder:
         again = replace(request, template=AUTO, out=Path(folder))
         summary, _ = _measure(again, stop=stop, observer=observer)

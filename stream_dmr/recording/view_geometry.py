@@ -83,8 +83,9 @@ class MeshRebuilder:
         body = self._bodies[shape.candidate or 0]
         points = deform(body, KINDS[report.deformation], shape.parameters)
         v = body.num_vertices
-        # The recorded keypoints determine the fit's place along the viewing ray of its crop.
-        offset = (shape.keypoints - points[v : v + 3]).mean(axis=0)
+        # Head and center determine the fit's place along the viewing ray of its crop; the tail of
+        # a still may have been moved on behind the mesh.
+        offset = (shape.keypoints[:2] - points[v : v + 2]).mean(axis=0)
         return replace(fit, shape=replace(shape, vertices=points[:v] + offset))
 
 

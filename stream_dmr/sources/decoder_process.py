@@ -30,7 +30,8 @@ import numpy as np
 # A line of the levels "panic", "fatal" or "error", or H.264's note of concealment, an information.
 _ERRORS = re.compile(rb"FFMPEG:(00|08|16)\]|\bconcealing\b")
 
-# OpenCV scales pictures of another size to that of the first; H.264 and HEVC print such a change.
+# OpenCV scales pictures of another size to that of the first. H.264 prints such a change, with the
+# size in whole macroblocks; other codecs print none, so that their pictures are squeezed unnoticed.
 _SIZES = re.compile(rb"\bReinit context to (\d+)x(\d+)")
 
 NUM_SLOTS = 8  # most of them hold pictures in use

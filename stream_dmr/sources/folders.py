@@ -259,6 +259,7 @@ class ClipFolder(Source):
         try:
             yield from video
         except SourceError as error:
+            video.is_cut_off = True
             video.close()
             self._on_notice(f"{error}; the rest of the clip was left out")
 

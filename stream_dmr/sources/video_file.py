@@ -49,7 +49,7 @@ class VideoFile(Source):
         self.height, self.width = self._decoder.height, self._decoder.width
         promised = self._decoder.promised
         if self._is_matroska:  # its duration, of which OpenCV computes the number, begins at zero
-            promised -= min(self._decoder.before_start, promised - 1)
+            promised -= min(self._decoder.before_start, max(promised - 1, 0.0))
         self.num_frames = promised_frames(promised)
         self.fps = plausible_fps(self._decoder.fps, settings)
         if self._decoder.turned_deg % 360 and settings.orientation == "sensor":

@@ -202,7 +202,7 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
                 for part in edited.parts
                 if part.track_id in tracks and part.overlaps(tracks[part.track_id].estimate)
             ]
-            known.sort(key=lambda pair: pair[1].estimate.first_frame)
+            known.sort(key=lambda pair: max(pair[0].first_frame, pair[1].estimate.first_frame))
             estimate = _with_catch(estimate_of(edited.row), known)
             run_id = known[0][1].run_id if known else list(runs)[-1]  # that of its first frames
             made[track_id] = fish(edited.row, estimate, run_id, origin=edited.kind)
@@ -219,7 +219,9 @@ def _with_catch(
     """With the species of the first track, and the fate of the last track if it ended there."""
     if not known:
         return estimate
-    first, (part, last) = known[0][1].estimate, (known[-1][0], known[-1][1].estimate)
+    first = known[0][1].estimate
+    part, fish = max(known, key=lambda pair: min(pair[0].last_frame, pair[1].estimate.last_frame))
+    last = fish.estimate
     is_whole = part.last_frame >= last.last_frame
     return replace(
         estimate,

@@ -42,7 +42,7 @@ _PICTURE_PX, _WEBP_QUALITY = 64, 50
 FISH_COLUMNS = ("id", "utc", "length_mm", "low_mm", "high_mm", "species", "status", "haul", "fate")
 _WRITTEN = "digest"  # the kind of event that notes a written digest
 _DAY_NS, _EPOCH = 86_400_000_000_000, date(1970, 1, 1)
-_SETTLE_NS = 600_000_000_000  # wait after a day's end: a row of `watched` spans a minute
+_SETTLE_NS = 600_000_000_000  # wait after a day's end; chosen; a row of `watched` spans a minute
 _LOOK_S, _NEVER = 300.0, threading.Event()
 
 

@@ -257,7 +257,8 @@ class VerdictRecorder:
                         f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
                         "must be undone first"
                     )
-        if undone.kind in ("correct", "withdraw"):
+        # A blind reading builds on nobody's points, and must not tell of others'.
+        if undone.kind in ("correct", "withdraw") and self._reading is None:
             counted = standing(earlier)
             for later in earlier[number:]:
                 is_of_fish = later.kind == "correct" and later.track_id == undone.track_id

@@ -16,6 +16,7 @@ from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishEnds, SolverReport
 from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.recording.view_geometry import MeshRebuilder
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
     FRAME_CAMERA,
@@ -97,8 +98,11 @@ def test_a_still_s_tail_is_where_its_mask_ends_unless_that_is_far_away(added, is
 
     def fitted(mask, length_doubt):
         quality = replace(exact.quality, length_doubt=length_doubt)
-        shape = fitter.fit(replace(exact, mask=mask > 0, quality=quality), warm).mesh.shape
+        mesh = fitter.fit(replace(exact, mask=mask > 0, quality=quality), warm).mesh
+        shape, lean = mesh.shape, replace(mesh, shape=replace(mesh.shape, vertices=None))
         np.testing.assert_array_equal(shape.midline[-1], shape.keypoints[2])
+        again = MeshRebuilder(TEMPLATE, None).with_vertices(lean).shape.vertices
+        np.testing.assert_allclose(again, shape.vertices, rtol=0, atol=1e-12)
         return shape, beyond_tail(mask > 0, camera.project(shape.midline))
 
     _, of_mesh = fitted(mask, None)  # whose tail keypoint lies before the end of the mesh

@@ -239,5 +239,5 @@ def test_a_mesh_that_names_no_kind_of_length_is_said_to_give_no_weight():
     record = {"species": "Pacific halibut", "length_mm": 800.0}
     lacking = record | {"weight_kg": None, "is_legal_size": None}
     (line,) = unweighed_note([lacking], FisheriesSettings())
-    assert "add [length] to its TOML" in line
+    assert "its TOML needs [length] tail" in line
     assert unweighed_note([lacking | {"weight_kg": 6.0}], FisheriesSettings()) == []

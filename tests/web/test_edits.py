@@ -152,9 +152,13 @@ def test_tracks_that_were_mixed_up_are_put_right(queue: ReviewQueue, out: Path):
 @pytest.fixture
 def parted(tmp_path: Path) -> Path:
     """A halibut in frames 1 to 4, dropped, and a cod in frames 5 to 8, landed."""
-    clip = tmp_path / "clip"
-    write_clip(clip, fish=[[1]] * 4 + [[2]] * 4)
-    measure_source(request(clip, tmp_path / "out"), stop=threading.Event())
+    write_clip(tmp_path / "clip", fish=[[1]] * 4 + [[2]] * 4)
+    return known_fish(tmp_path)
+
+
+def known_fish(tmp_path: Path) -> Path:
+    """Measure the clip there; its fish 1 is a halibut that was dropped, 2 a cod that was landed."""
+    measure_source(request(tmp_path / "clip", tmp_path / "out"), stop=threading.Event())
     known = {1: ("HAL", "dropped"), 2: ("COD", "landed")}
     with closing(sqlite3.connect(tmp_path / "out" / "lengths.db")) as database:
         for track_id, values in known.items():
@@ -177,6 +181,16 @@ def test_a_merged_fish_has_the_first_species_and_the_last_fate(parted: Path, gon
     made = submit(queue, "split", kept, frame_index=5)  # where it was merged
     [other] = made.keys() - {kept}
     assert [named(parted)[kept], named(parted)[other]] == [before[1], before[2]]
+
+
+def test_tracks_that_were_mixed_up_have_the_species_and_fates_of_their_frames(tmp_path: Path):
+    write_clip(tmp_path / "clip", fish=[[1]] + [[1, 2]] * 7)
+    out = known_fish(tmp_path)
+    queue = ReviewQueue([open_report(out)], reviewer="Ada")
+    submit(queue, "split", 1, frame_index=5)
+    submit(queue, "split", 2, frame_index=5)
+    submit(queue, "merge", 2, other_fish=3, sure=True)  # the cod's frames, then the halibut's
+    assert named(out)[3] == ("COD", "dropped")
 
 
 @pytest.mark.parametrize(
@@ -207,6 +221,15 @@ def test_moved_points_that_others_build_on_are_not_undone(
     submit(other, "undo")
     submit(queue, "undo")
     assert verify(out)[0] == []
+
+
+def test_a_blind_reader_undoes_whatever_others_moved(queue: ReviewQueue, out: Path):
+    blind = ReviewQueue([open_report(out, as_measured=True)], reviewer="Grace", blind=True)
+    for judge, view in zip((blind, queue), queue.detail(0, 1)["views"], strict=False):
+        head, _, tail = view["keypoints"]
+        submit(judge, "correct", 1, frame_index=view["frame"], head=head, tail=tail)
+    submit(blind, "undo")
+    assert len(read_verdicts(out / "lengths.db")) == 3
 
 
 def test_undo_takes_edits_back_one_by_one(queue: ReviewQueue, out: Path):
