@@ -234,7 +234,8 @@ def test_stop_drops_what_waits_before_the_slow_stage_and_finishes_what_came_afte
             while message.frame_index == 3 and not stop.is_set():
                 # The queues before it are full, and none has been busy longer.
                 others = [chain.counters[stage].busy_s for stage in (0, 1, 3)]
-                if chain.waiting()[:2] == [2, 2] and chain.longest_busy_s() > max(others):
+                # By far: a loaded machine may keep another stage from ending its step.
+                if chain.waiting()[:2] == [2, 2] and chain.longest_busy_s() > max(others) + 0.3:
                     stop.set()
                 time.sleep(0.001)
             return super().step(message)
