@@ -60,6 +60,7 @@ from stream_dmr.store.open_results import require_free_names
 from stream_dmr.store.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
 from stream_dmr.store.schema import CUT_OFF_BY_STOP, HAULS, WATCHED, read_rows
+from stream_dmr.store.trip import haul_values
 from stream_dmr.tracking.finder import open_finder
 
 
@@ -101,13 +102,12 @@ def open_replay_outputs(
     Raises OutputError if the folder can't be written to, or holds an earlier run's results.
     """
     header = new_header(request, recording.header, inputs, second)
+    databases = _databases(request.recordings)
     try:
         known, flags = read_recorded_run(request.recordings, recording.header)
-        is_readable = True
     except OutputError as error:
-        is_readable = False
         observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
-        known, flags = None, {}
+        known, flags, databases = None, {}, []
     signer = None if request.key is None else Signer(request.key)
     if inputs.candidates is not None and inputs.candidates.stocks() is not None:
         require_free_names(out, overwrite=request.overwrite)
@@ -123,8 +123,7 @@ def open_replay_outputs(
         files.attach(store, repaired=[])
         stack.callback(partial(files.finish, with_recordings=True))
         store.count_frames(None if known is None else known.frames_promised)
-        if is_readable:
-            _take_over_hauls(request, store)
+        _take_over_hauls(databases, store, span_ns=request.selection.time_ns)
         lengths = stack.enter_context(closing(LengthsTable(out, store)))
         save_learnt(inputs, out, source=header.source)
         recorder = Recorder(
@@ -154,12 +153,13 @@ def open_replay_outputs(
         store.end(STOPPED if stop.is_set() else _end_of(request, known))
 
 
-def _take_over_hauls(request: ReplayOptions, store: LengthStore) -> None:
-    """Copy the hauls beside the recordings, and what of the replayed time was watched."""
-    span_ns = request.selection.time_ns
-    for database in _databases(request.recordings):
+def _take_over_hauls(
+    databases: Sequence[Path], store: LengthStore, *, span_ns: tuple[int, int] | None
+) -> None:
+    """Copy hauls, and what of a span of time was watched; None: of all."""
+    for database in databases:
         for row in read_rows(database, HAULS):
-            values = {name: row[name] for name in ("what", "name", "timestamp_ns", "said_by")}
+            values = haul_values(row["what"], row["name"], row["timestamp_ns"], row["said_by"])
             store.append(HAULS, row["name"], values, is_urgent=False)
         for row in read_rows(database, WATCHED):
             first_ns, last_ns = row["first_ns"], row["last_ns"]

@@ -95,7 +95,7 @@ class _Printed:
         self.resized: tuple[int, int] | None = None  # height and width that came instead
 
     def has_errors(self) -> bool:
-        """True if errors were printed since the last call."""
+        """True if errors were printed since the last call; takes note of a change of size."""
         self._flush(None)
         num_bytes = os.fstat(self._file).st_size
         if not num_bytes:

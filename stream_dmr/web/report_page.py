@@ -76,8 +76,8 @@ def trip_section(
     fish = [caught for report in reports for caught in report.fish if caught.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
     drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
-    facts = [run for report in reports for run in report.runs]
-    heading = _heading(fish, facts)
+    runs = [run for report in reports for run in report.runs]
+    heading = _heading(fish, [*runs, *(caught.facts for caught in fish)])
     if not (heading or drawn or any(row["haul"] != "-" for row in rows)):
         return ""
     return render("report/trip.html", heading=heading, rows=rows, map=drawn, is_folded=is_folded)
@@ -86,8 +86,8 @@ def trip_section(
 def _heading(fish: Sequence[Fish], runs: Sequence[RunFacts]) -> str:
     """Vessel, trip and hauls, and the time from the first fish to the last."""
     parts = [
-        _named("", {facts.vessel for facts in (*runs, *(caught.facts for caught in fish))}),
-        _named("trip", {facts.trip for facts in (*runs, *(caught.facts for caught in fish))}),
+        _named("", {facts.vessel for facts in runs}),
+        _named("trip", {facts.trip for facts in runs}),
         _named("haul", {caught.haul for caught in fish}),
     ]
     heading = ", ".join(part for part in parts if part)

@@ -244,25 +244,20 @@ class VerdictRecorder:
         number = last_of(earlier, self._reviewer, self._reading)
         if number is None:
             raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
-        undone = earlier[number - 1]
+        undone, counted = earlier[number - 1], standing(earlier)
+        since = [later for later in earlier[number:] if later in counted]
         if undone.kind in EDITS:
-            fish, counted = {undone.track_id, undone.other_fish} - {None}, standing(earlier)
-            for later in earlier[number:]:
-                if later in counted and fish & {
-                    later.track_id,
-                    later.other_fish,
-                    later.duplicate_of,
-                }:
+            fish = {undone.track_id, undone.other_fish} - {None}
+            for later in since:
+                if fish & {later.track_id, later.other_fish, later.duplicate_of}:
                     raise UserError(
                         f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
                         "must be undone first"
                     )
         # A blind reading builds on nobody's points, and must not tell of others'.
         if undone.kind in ("correct", "withdraw") and self._reading is None:
-            counted = standing(earlier)
-            for later in earlier[number:]:
-                is_of_fish = later.kind == "correct" and later.track_id == undone.track_id
-                if is_of_fish and later in counted:  # its length is of all points moved by then
+            for later in since:  # its length is of all points moved by then
+                if later.kind == "correct" and later.track_id == undone.track_id:
                     raise UserError(
                         f"undo: {later.reviewer} has moved points of fish {later.track_id} since; "
                         "that must be undone first"
