@@ -187,6 +187,9 @@ class ClipFolder(Source):
     predecessor ended.
     """
 
+    is_endless = True  # the folder may grow; it ends when no new clip came for `clips_wait_s`
+    has_clips = True
+
     def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
         """Raises SourceError if no clip can be read."""
         self.name = folder.resolve().name
@@ -206,15 +209,6 @@ class ClipFolder(Source):
         self.width, self.height, self.fps = first.width, first.height, first.fps
         self.num_frames = None
         first.close()
-
-    @property
-    def is_endless(self) -> bool:
-        """True: the folder may grow; it ends when no new clip came for `clips_wait_s`."""
-        return True
-
-    @property
-    def has_clips(self) -> bool:
-        return True
 
     def announce_pauses(self, on_pause: Callable[[], None]) -> None:
         self._on_pause = on_pause

@@ -87,6 +87,8 @@ class LiveStream(Source):
     end, and nothing of them is dropped.
     """
 
+    is_live = True
+
     def __init__(self, address: str, settings: ReadFramesSettings) -> None:
         """Raises SourceError if no picture comes for `connect_s`."""
         is_camera = address.isdecimal()
@@ -114,19 +116,11 @@ class LiveStream(Source):
         self.width, self.height = self._decoder.width, self._decoder.height
         self.fps = plausible_fps(self._decoder.fps, settings)
         self.num_frames = promised_frames(self._decoder.promised)
+        self.is_endless = self.num_frames is None  # else the address is that of a stored video
         self._receiver = threading.Thread(
             target=self._receive, args=(first,), name=f"receiver of {self.name}", daemon=True
         )
         self._receiver.start()
-
-    @property
-    def is_endless(self) -> bool:
-        """True unless the address is that of a stored video."""
-        return self.num_frames is None
-
-    @property
-    def is_live(self) -> bool:
-        return True
 
     @property
     def counts(self) -> CameraCounts:

@@ -43,7 +43,7 @@ class ResumePoint:
 class Source(ABC):
     """Frames in order, to be iterated once; `frame_index` from 1, `timestamp_ns` increasing.
 
-    The properties describe what a source can do, so that no user has to ask for its class. The
+    The attributes describe what a source can do, so that no user has to ask for its class. The
     defaults are those of a file: it ends, can be read again, and begins again in every run.
     """
 
@@ -54,21 +54,10 @@ class Source(ABC):
     fps: float
     is_cut_off: bool = False  # True if it ended too early, or by damage
     warnings: list[str]  # problems that did not end the reading, one line each; complete at the end
-
-    @property
-    def is_endless(self) -> bool:
-        """True for cameras and growing folders, which end only when closed (or idle for long)."""
-        return False
-
-    @property
-    def is_live(self) -> bool:
-        """True for cameras and streams: their frames come by themselves and only once."""
-        return False
-
-    @property
-    def has_clips(self) -> bool:
-        """True if `Frame.source` names one of several clips, each read once over all runs."""
-        return False
+    # True for cameras and growing folders, which end only when closed (or idle for long).
+    is_endless: bool = False
+    is_live: bool = False  # True for cameras and streams: their frames come by themselves, once
+    has_clips: bool = False  # True if `Frame.source` names a clip of several, each read once
 
     @property
     def counts(self) -> CameraCounts | None:

@@ -36,17 +36,9 @@ class MadeUpSource(Source):
     """A camera or a folder of clips without frames; keeps where it is to resume."""
 
     def __init__(self, *, is_live: bool = False, has_clips: bool = False) -> None:
-        self._is_live, self._has_clips = is_live, has_clips
+        self.is_live, self.has_clips = is_live, has_clips
         self.point: ResumePoint | None = None
         self.on_notice: Callable[[str], None] = refuse_notices
-
-    @property
-    def is_live(self) -> bool:
-        return self._is_live
-
-    @property
-    def has_clips(self) -> bool:
-        return self._has_clips
 
     def listen(self, on_notice: Callable[[str], None]) -> None:
         self.on_notice = on_notice
