@@ -65,7 +65,7 @@ class McapSink:
         segment_number: int | None = None,
     ) -> None:
         """`flush_s` in seconds. Raises OutputError if the disk refuses the file."""
-        self.path = path
+        self.path, self.name = path, path.name
         self._part = path.with_name(path.name + PART)
         if self._part.exists():
             raise OutputError(
@@ -101,10 +101,6 @@ class McapSink:
             with suppress(OSError):
                 self._part.unlink(missing_ok=True)
             raise self._output_error(error) from error
-
-    @property
-    def name(self) -> str:
-        return self.path.name
 
     @property
     def size(self) -> int:

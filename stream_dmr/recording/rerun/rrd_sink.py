@@ -47,7 +47,7 @@ class RrdSink:
     """
 
     def __init__(self, path: Path, header: RunHeader, settings: RecordingSettings) -> None:
-        self.path = path
+        self.path, self.name = path, path.name
         self._flush_ns = int(_MCAP_FLUSHES * settings.flush_s * 1e9)
         self._with_messages = settings.rrd_messages
         self._closed = False
@@ -67,10 +67,6 @@ class RrdSink:
                 self._log([*_HEADER_ENTITY, name], data)
                 self._counts["/".join(["", *_HEADER_ENTITY, name])] = 1
         self._flush()
-
-    @property
-    def name(self) -> str:
-        return self.path.name
 
     def write(self, record: Record) -> None:
         """Draw one record. Raises OutputError if the disk refuses it, and closes the file."""
