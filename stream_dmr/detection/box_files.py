@@ -211,11 +211,7 @@ _TOO_LARGE = (OverflowError, RecursionError)  # an infinite number; deeply neste
 def parse_coco(
     text: str, path: Path, pictures: Sequence[Path] = ()
 ) -> dict[int, list[AnnotatedBox]]:
-    """Boxes by frame, from a file's text; `path` is for messages.
-
-    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
-    expected, and where.
-    """
+    """A `Parser`."""
     try:
         table = json.loads(text)
         images = {int(image["id"]): image for image in table["images"]}
@@ -290,11 +286,7 @@ def _track_id(annotation: dict[str, Any]) -> int:
 def parse_cvat(
     text: str, path: Path, pictures: Sequence[Path] = ()
 ) -> dict[int, list[AnnotatedBox]]:
-    """Boxes by frame, from a file's text; `path` is for messages.
-
-    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
-    expected, and where.
-    """
+    """A `Parser`."""
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
@@ -346,11 +338,7 @@ _END = re.compile(r"\(kp\) (head|tail) (\S+) (\S+)")
 def parse_viame(
     text: str, path: Path, pictures: Sequence[Path] = ()
 ) -> dict[int, list[AnnotatedBox]]:
-    """Boxes by frame, from a file's text; `path` is for messages.
-
-    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
-    expected, and where.
-    """
+    """A `Parser`."""
     lines = csv.reader(text.splitlines())
     try:
         rows = [
@@ -470,6 +458,10 @@ def _label_boxes(
 _MAX_SHARE = 2.0  # chosen: a box may go on beyond the picture, and pixels are larger
 _MAX_BYTES = 1 << 29  # chosen: some ten million boxes
 Parser = Callable[[str, Path, Sequence[Path]], dict[int, list[AnnotatedBox]]]
+"""Boxes by frame, from a file's text, its path for messages, and the source's pictures in order.
+
+A video has none. Raises AnnotationError with what was expected, and where.
+"""
 _PARSERS: Mapping[str, Parser] = {".json": parse_coco, ".xml": parse_cvat}
 
 

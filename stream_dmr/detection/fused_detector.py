@@ -8,7 +8,7 @@ both are followed; `tracking.confirmation` decides which of them count.
 Most of a film is water, in which not every picture needs to be examined: see `passes_over`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ class FusedDetector:
     def __init__(
         self, motion: MotionDetector, looks: Detector, settings: LookSettings | None = None
     ) -> None:
-        self._motion = motion
+        self._motion, self.refused = motion, motion.refused
         self._looks = looks
         self._every_ns = round(1e9 * (settings or LookSettings()).look_every_s)
         self._water = StillWater()
@@ -57,10 +57,6 @@ class FusedDetector:
         self._passed: Frame | None = None  # the last frame, where it was not looked at
         self._must_look = True  # at the next frame, whether or not anything moves in it
         self._beside = ThreadPoolExecutor(1, "looks")  # both take as long as each other
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        return self._motion.refused
 
     def passes_over(self, frame: Frame, *, is_followed: bool) -> bool:
         """True if the next frame need not be looked at, since nothing happens in it.

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -53,7 +54,16 @@ def open_annotated_fish(
     return AnnotatedFish(boxes=by_frame, masks=folder, across_frames=across_frames)
 
 
-class AnnotatedFish:
+class _GivenFish:
+    """A `FishFinder` of fish that somebody gave: all of them count, and their ids stay."""
+
+    open_ids: None = None  # a given id may come again at any time
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
+        return {track_id: [crop] for track_id, crop in crops.items()}
+
+
+class AnnotatedFish(_GivenFish):
     """A `FishFinder` that reads boxes and masks from files.
 
     With boxes alone, masks that their file draws are used, and the segmenter finds the others. With
@@ -120,15 +130,6 @@ class AnnotatedFish:
         if self._masks is not None:
             return np.zeros(shape, bool)
         return None if box.mask is None else box.mask(shape)
-
-    @property
-    def open_ids(self) -> None:
-        """None: a given id may come again at any time."""
-        return None
-
-    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
-        """All crops: every annotated object is a fish."""
-        return {track_id: [crop] for track_id, crop in crops.items()}
 
     @property
     def warnings(self) -> list[str]:
@@ -225,7 +226,7 @@ def names_pictures(path: Path) -> bool:
     return {PICTURE, FISH} <= set(re.findall(r"\w+", header.lower()))
 
 
-class NamedPictures:
+class NamedPictures(_GivenFish):
     """A `FishFinder` of pictures that show one fish each; the same id is the same fish.
 
     The fish is the largest candidate of the detector, or all fish pixels of the masks folder.
@@ -235,19 +236,10 @@ class NamedPictures:
         """Raises AnnotationError, with the line, if an id is no number from 1 on."""
         self._fish = _read(path)
         self._masks = found_by if isinstance(found_by, MaskFolder) else None
+        self.has_masks = self._masks is not None
         self._detector = found_by if isinstance(found_by, Detector) else None
         self._unnamed: list[str] = []
         self._seen: set[str] = set()
-
-    @property
-    def has_masks(self) -> bool:
-        """True with a masks folder."""
-        return self._masks is not None
-
-    @property
-    def open_ids(self) -> None:
-        """None: a given id may come again at any time."""
-        return None
 
     @property
     def warnings(self) -> list[str]:
@@ -297,10 +289,6 @@ class NamedPictures:
         areas = [np.prod(box[2:] - box[:2]) for box in boxes]
         return boxes[int(np.argmax(areas))] if boxes else np.array([0.0, 0.0, width, height])
 
-    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
-        """All crops: every named picture shows a fish."""
-        return {track_id: [crop] for track_id, crop in crops.items()}
-
 
 _MAX_BYTES = 100_000_000  # a million pictures; chosen
 
@@ -342,14 +330,11 @@ def _read(path: Path) -> dict[str, int]:
 class BoxDetector:
     """A `Detector` that returns the boxes of a file, clipped to the frame."""
 
+    refused: Mapping[str, int] = MappingProxyType({})  # every box of the file is a candidate
+
     def __init__(self, frames: Mapping[int, Sequence[AnnotatedBox]]) -> None:
         self._frames = frames
         self._last_frame = 0
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Empty: every box of the file is a candidate."""
-        return {}
 
     @property
     def unused(self) -> list[str]:

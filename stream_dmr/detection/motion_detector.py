@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping
 from enum import StrEnum
 
 import cv2
@@ -245,11 +244,7 @@ class MotionDetector:
         self._is_foreign: Bool[np.ndarray, "h w"] | None = None  # in the last picture's pixels
         self._background_from_picture: Affine = _IDENTITY
         self._shift_px = np.zeros(2)  # of the background, all together
-        self._refused: Counter[str] = Counter()
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        return self._refused
+        self.refused: Counter[str] = Counter()
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The moving blobs of a frame whose size and thickness may be those of fish."""
@@ -266,7 +261,7 @@ class MotionDetector:
             min_length_px=self._settings.motion_min_length * max(size),
             max_length_px=self._settings.motion_max_length * max(size),
         )
-        self._refused.update(refused)
+        self.refused.update(refused)
         return [_candidate(blob, width=width, height=height) for blob in blobs]
 
     def _moved_before(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"] | None:

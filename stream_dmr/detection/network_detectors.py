@@ -10,6 +10,7 @@ seas that move so much that no fish stands out by its motion.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import cv2
@@ -113,6 +114,8 @@ class OnnxSettings(Settings):
 class OnnxDetector:
     """A `Detector` of boxes and scores, and of masks if its layout has them."""
 
+    refused: Mapping[str, int] = MappingProxyType({})  # what was not found is not known
+
     def __init__(
         self,
         path: Path,
@@ -135,11 +138,6 @@ class OnnxDetector:
         noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
         for picture in (noise, np.zeros_like(noise), np.full_like(noise, 255)):
             self._try(picture)
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Empty: what was not found is not known."""
-        return {}
 
     @property
     def has_masks(self) -> bool:
@@ -250,15 +248,12 @@ _MIN_AREA_PX = 24  # in the network's input; chosen by hand, a few pixels wide a
 class UNetDetector:
     """A `Detector` of connected shapes with fish probability above 0.5; the score is their mean."""
 
+    refused: Mapping[str, int] = MappingProxyType({})  # what was not found is not known
+
     def __init__(self, segmenter: UNetSegmenter, *, longer_px: int) -> None:
         """`longer_px`: longer side of the network's input; fish should be 40 to 140 px in it."""
         self._segmenter = segmenter
         self._longer_px = longer_px
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Empty: what was not found is not known."""
-        return {}
 
     def find(self, frame: Frame) -> list[Candidate]:
         height, width = frame.image.shape[:2]
