@@ -223,13 +223,15 @@ def sync_path(path: Path) -> None:
 
 
 @contextmanager
-def writing_to(path: Path) -> Generator[None]:
+def writing_to(
+    path: Path, *, what: str = "a place", remedy: str = "choose another"
+) -> Generator[None]:
     """Raise an OSError in the block as an OutputError about `path`."""
     try:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path}: expected a place to write to, got: {error.strerror}; choose another"
+            f"{path}: expected {what} to write to, got: {error.strerror}; {remedy}"
         ) from error
 
 

@@ -1,15 +1,16 @@
 """Prepare the output folder of a run, and recover it after a crash."""
 
 import tempfile
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.seal import known_files, read_origin, sign_found
-from stream_dmr.files import free_name, require_unlocked
+from stream_dmr.files import free_name, require_unlocked, writing_to
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.reading import messages_of, open_recordings
 from stream_dmr.recording.recorder import STEM
@@ -30,6 +31,7 @@ RESULTS = (
 )
 SEGMENTS = f"{STEM}-*"  # the recordings of an endless run
 ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", SEGMENTS)
+_writing_to = partial(writing_to, what="a folder", remedy="choose another --out")
 _PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
 
 
@@ -104,16 +106,6 @@ def _require_no_others(out: Path) -> None:
             f"{out}: expected a folder for a run, found {PROVENANCE} of "
             f"{'exports' if is_exported else 'a batch'}, which stays; choose another --out"
         )
-
-
-@contextmanager
-def _writing_to(out: Path) -> Generator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(
-            f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
-        ) from error
 
 
 def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
