@@ -359,29 +359,26 @@ def _localize_by_two(
     return LocalizeByTwo(setup.config.localize, calibration, others, other, pairing, common)
 
 
+@dataclass(eq=False)
 class LocalizeByTwo:
     """A node in the place of Localize: places fish by two cameras if both saw them.
 
     Of such a fish only the frames that both cameras saw count.
     """
 
-    def __init__(
-        self,
-        settings: LocalizeSettings,
-        calibration: Calibration,
-        second: Mapping[int, FishSightings],
-        second_calibration: Calibration,
-        pairing: Pairing,
-        common: CommonMeshes | None = None,
-    ) -> None:
-        self._settings = settings
-        self._calibration, self._second_calibration = calibration, second_calibration
+    settings: LocalizeSettings
+    calibration: Calibration
+    second: Mapping[int, FishSightings]
+    second_calibration: Calibration
+    pairing: Pairing
+    common: CommonMeshes | None = None
+
+    def __post_init__(self) -> None:
         # Frames that the second camera fitted poorly are tried where the others don't suffice.
-        self._seconds = well_fitted(second, settings), second
-        self.pairing, self._common = pairing, common
+        self._seconds = well_fitted(self.second, self.settings), self.second
 
     def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
-        alone = localize(mesh, settings=self._settings, calibration=self._calibration)
+        alone = localize(mesh, settings=self.settings, calibration=self.calibration)
         others = self.pairing.ids.get(mesh.track_id, ())
         if not others or alone.reason not in _BY_ONE_CAMERA or alone.midline_mm is None:
             return [alone]
@@ -390,7 +387,7 @@ class LocalizeByTwo:
         for second in self._seconds:
             for other in others:
                 fish = second.get(other)
-                view = fish and fish.at(time_ns, self._second_calibration)
+                view = fish and fish.at(time_ns, self.second_calibration)
                 if view is not None:
                     placed.append(self._place(mesh, alone, other, view, time_ns))
                     if placed[-1].accepted:
@@ -406,9 +403,9 @@ class LocalizeByTwo:
         assert alone.keypoints_mm is not None, "a placed fish was fitted"
         assert alone.midline_mm is not None, "a placed fish was fitted"
         first = View(
-            midline_px=self._calibration.camera.project(alone.midline_mm),
+            midline_px=self.calibration.camera.project(alone.midline_mm),
             center_px=alone.keypoints_px[1],
-            calibration=self._calibration,
+            calibration=self.calibration,
             iou=alone.iou or 0.0,
         )
         placed = place_between((first, second), alone.midline_mm)
@@ -419,7 +416,7 @@ class LocalizeByTwo:
                 place_between((first, turned), alone.midline_mm),
                 key=lambda placement: placement.misfit,
             )
-        common = self._common and self._common.mesh(mesh, other, second, time_ns)
+        common = self.common and self.common.mesh(mesh, other, second, time_ns)
         if common is not None:
             placed = agreed(placed, common.midline_mm, common.iou)
         line = placed.midline_mm
@@ -429,7 +426,7 @@ class LocalizeByTwo:
         if common is None or common.iou < _GOOD_IOU:
             if alone.reason == str(Reason.POOR_FIT):
                 reason = Reason.POOR_FIT
-            elif second.iou < self._settings.min_iou:
+            elif second.iou < self.settings.min_iou:
                 reason = Reason.SEEN_BY_ONE
             elif placed.misfit > _MOST_MISFIT:
                 reason = Reason.CAMERAS_DISAGREE

@@ -187,59 +187,55 @@ def _end_of(request: ReplayOptions, recorded: RunFacts | None) -> str:
     return SOURCE_ENDED
 
 
+@dataclass(kw_only=True, eq=False)
 class ReplayWriter:
     """Records and compares the messages of the chain; returns each as a recording would hold it."""
 
-    def __init__(
-        self,
-        recorded: RecordedMessages,
-        *,
-        recomputed: Sequence[type[Message]],
-        settings: RecordingSettings,
-        results: ResultWriter | None,
-        whole: WholeRecords,
-        comparator: MessageComparator,
-    ) -> None:
-        """`results`, None without --out, gets `whole` records of messages not recomputed."""
-        self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
-        self._results, self._whole, self._comparator = results, whole, comparator
-        positions = recorded.of_type(Position, keep_payloads=False)
-        self._positions = SoughtMessages(iter(()) if results is None else positions)
+    recorded: RecordedMessages
+    recomputed: Sequence[type[Message]]
+    settings: RecordingSettings
+    results: ResultWriter | None  # None: without --out
+    whole: WholeRecords  # of messages that are not recomputed
+    comparator: MessageComparator
+    num_frames: int = 0
+
+    def __post_init__(self) -> None:
+        positions = self.recorded.of_type(Position, keep_payloads=False)
+        self._positions = SoughtMessages(iter(()) if self.results is None else positions)
         self.totals = RunTotals(max_fish=None)
-        self.num_frames = 0
 
     def write(self, message: Message) -> Message:
         """Record, compare and count a message; returns it as the next node gets it."""
-        if type(message) in self._recomputed or isinstance(message, TrackEnded):
-            if self._results is not None:
-                message = self._results.write(message)
+        if type(message) in self.recomputed or isinstance(message, TrackEnded):
+            if self.results is not None:
+                message = self.results.write(message)
             else:
-                message = as_recorded(message, self._settings)
-            self._comparator.compare(message)
+                message = as_recorded(message, self.settings)
+            self.comparator.compare(message)
             self.totals.take(message)
             return message
-        payload = self._recorded.payload(message)
+        payload = self.recorded.payload(message)
         if isinstance(message, Frame):
             self.num_frames += 1
             self.totals.take(message)
-        if self._results is not None:
-            self._results.store(message)
-            self._results.put(self._whole.of(message, payload))
+        if self.results is not None:
+            self.results.store(message)
+            self.results.put(self.whole.of(message, payload))
             if isinstance(message, Frame):
                 for position in self._positions.until(message.frame_index):
-                    self._results.write(position)
+                    self.results.write(position)
         return message
 
     def finish(self) -> None:
         """Record the rest after the last frame: positions, and messages of a second camera."""
-        if self._results is not None:
-            self._results.put(self._whole.rest())
+        if self.results is not None:
+            self.results.put(self.whole.rest())
             for position in self._positions.rest():
-                self._results.write(position)
+                self.results.write(position)
 
     def frame_done(self) -> None:
-        if self._results is not None:
-            self._results.frame_done()
+        if self.results is not None:
+            self.results.frame_done()
 
 
 # Allowed relative difference of lengths if the last bits are rounded differently: a fit stops at a
@@ -309,7 +305,7 @@ def replay(
         unlike = {fish.track_id for fish in carried_over} if FittedMesh in kinds else ()
         comparator = MessageComparator(recorded, kinds, leave_out=unlike)
         writer = ReplayWriter(
-            recorded,
+            recorded=recorded,
             recomputed=recomputed,
             settings=inputs.config.recording,
             results=results,

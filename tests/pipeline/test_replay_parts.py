@@ -89,7 +89,7 @@ def test_no_shapes_are_learnt_where_the_settings_have_none(
 def test_recorded_messages_pass_as_they_are_and_are_counted(recording: Recording):
     recorded = RecordedMessages(recording)
     writer = ReplayWriter(
-        recorded,
+        recorded=recorded,
         recomputed=[LengthEstimate],
         settings=SETTINGS,
         results=None,
@@ -106,7 +106,7 @@ def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Reco
     recorded = RecordedMessages(recording)
     comparator = MessageComparator(recorded, [LengthEstimate])
     writer = ReplayWriter(
-        recorded,
+        recorded=recorded,
         recomputed=[LengthEstimate],
         settings=SETTINGS,
         results=None,
