@@ -58,7 +58,7 @@ class AnnotatedBox:
     track_id: int  # 1 or more, or UNKNOWN_ID
     # Half-open, frame pixels; may extend beyond the frame. Shares of the frame's size, see `in_px`.
     bbox_xyxy_px: Float[np.ndarray, "4"]
-    visibility: float  # visible fraction of the fish, 0 to 1; 1 where not given
+    visibility: float = 1.0  # visible fraction of the fish, 0 to 1; 1 where not given
     score: float = 1.0  # confidence of the detector, 0 to 1; 1 where not given
     # Makes the mask in a frame of a height and width, or raises AnnotationError; None: not given.
     mask: Callable[[tuple[int, int]], Bool[np.ndarray, "H W"]] | None = None
@@ -263,7 +263,6 @@ def _annotation_boxes(
         box = AnnotatedBox(
             track_id=track_id,
             bbox_xyxy_px=box_from_xywh(x, y, width, height, where=where),
-            visibility=1.0,
             score=score,
             mask=partial(decode_coco, segmentation=drawn, where=where) if is_outline else None,
             check_size=partial(require_size, images[image_id], where=where),
@@ -327,7 +326,7 @@ def _box(
             f"got {element.attrib}"
         ) from None
     box = box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where)
-    return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)
+    return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box)
 
 
 _VIAME_HEAD = "# 1: Detection or Track-id"
@@ -385,7 +384,6 @@ def _viame_box(
     box = AnnotatedBox(
         track_id=track_id,
         bbox_xyxy_px=box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where),
-        visibility=1.0,
         score=score if 0 <= score <= 1 else 1.0,
         mask=partial(fill_parts, parts=parts) if parts else None,
         species="" if cells[9:10] == [] or cells[9].startswith("(") else cells[9].strip(),
@@ -448,7 +446,6 @@ def _label_boxes(
         box = AnnotatedBox(
             track_id=int(track_id),
             bbox_xyxy_px=box_from_xywh(x - width / 2, y - height / 2, width, height, where=where),
-            visibility=1.0,
             score=score,
             is_relative=True,
         )

@@ -67,8 +67,7 @@ def measure_boxes(
             "source has them; give --source"
         )
     annotated = {
-        index: [AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)]
-        for index, box in boxes.items()
+        index: [AnnotatedBox(track_id=track_id, bbox_xyxy_px=box)] for index, box in boxes.items()
     }
     setup = Setup(
         config=config,

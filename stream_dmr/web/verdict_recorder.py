@@ -245,23 +245,21 @@ class VerdictRecorder:
         if number is None:
             raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
         undone, counted = earlier[number - 1], standing(earlier)
-        since = [later for later in earlier[number:] if later in counted]
-        if undone.kind in EDITS:
-            fish = {undone.track_id, undone.other_fish} - {None}
-            for later in since:
-                if fish & {later.track_id, later.other_fish, later.duplicate_of}:
-                    raise UserError(
-                        f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
-                        "must be undone first"
-                    )
+        fish = {undone.track_id, undone.other_fish} - {None}
         # A blind reading builds on nobody's points, and must not tell of others'.
-        if undone.kind in ("correct", "withdraw") and self._reading is None:
-            for later in since:  # its length is of all points moved by then
-                if later.kind == "correct" and later.track_id == undone.track_id:
-                    raise UserError(
-                        f"undo: {later.reviewer} has moved points of fish {later.track_id} since; "
-                        "that must be undone first"
-                    )
+        moves_points = undone.kind in ("correct", "withdraw") and self._reading is None
+        for later in (verdict for verdict in earlier[number:] if verdict in counted):
+            named = {later.track_id, later.other_fish, later.duplicate_of}
+            if undone.kind in EDITS and fish & named:
+                what = "decided on"
+            elif moves_points and later.kind == "correct" and later.track_id == undone.track_id:
+                what = "moved points of"  # its length is of all points moved by then
+            else:
+                continue
+            raise UserError(
+                f"undo: {later.reviewer} has {what} fish {later.track_id} since; that must be "
+                "undone first"
+            )
         return replace(verdict, track_id=undone.track_id, undoes=number)
 
     def _corrected(
