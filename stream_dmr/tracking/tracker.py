@@ -110,9 +110,6 @@ class Tracker:
             if track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
         ]
 
-    def _fish_inside(self, observation: Observation) -> list[Track]:
-        return [track for track in self._inside(observation) if track.may_be_hidden]
-
     def _split(self, frame: Frame, observation: Observation) -> list[Observation]:
         """The pieces of a blob that several fish share; `[observation]` for any other."""
         inside = self._inside(observation)
@@ -136,7 +133,7 @@ class Tracker:
         """Drop observations that contain several fish; those fish are kept inside them."""
         separate = []
         for observation in observations:
-            fish = self._fish_inside(observation)
+            fish = [track for track in self._inside(observation) if track.may_be_hidden]
             largest = max((track.area for track in fish), default=0.0)
             if len(fish) > 1 and observation.area > _MIN_MERGED_AREA_RATIO * largest:
                 for track in fish:
