@@ -62,14 +62,12 @@ def load_species(own: str = "") -> list[Species]:
 
 def find_species(text: str, species: Sequence[Species]) -> Species | None:
     """The species whose code or name is this text, in any capitals; None if there is none."""
-    return next((known for known in species if is_called(known, text)), None)
-
-
-def is_called(species: Species, text: str) -> bool:
-    """True if a text is the code or a name of a species, in any capitals."""
     wanted = text.strip().casefold()
-    names = (species.code, species.scientific_name, species.english_name)
-    return wanted in [name.casefold() for name in names]
+    for known in species:
+        names = (known.code, known.scientific_name, known.english_name)
+        if wanted in [name.casefold() for name in names]:
+            return known
+    return None
 
 
 @cache

@@ -58,11 +58,6 @@ class TrackLength:
         self._refused: Counter[str] = Counter()
         self._refusal = ""  # of the last frame, before the filter saw it
 
-    @property
-    def last_timestamp_ns(self) -> int:
-        """Capture time of the last frame, good or not."""
-        return self._last.timestamp_ns
-
     def add(self, fish: LocalizedFish) -> LengthEstimate:
         """Take the next frame of this fish, the first one included; the running estimate."""
         self._last = fish

@@ -42,7 +42,6 @@ class ReviewQueue:
         """UserError if a report has no database or no recording."""
         for report in reports:
             require_recording(report.recording, where=report.path, what="a review")
-        self._reviewer, self._blind = reviewer, blind
         self.placed = place(reports)
         self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
         self._measured = set[int]() if sample is None else measured_numbers(self.placed)
