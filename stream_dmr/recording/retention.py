@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -24,6 +25,7 @@ _THINNED_TOPICS = {VIDEO, *FOXGLOVE_TOPICS}
 _PERIOD_S = 5.0  # chosen: a run writes some 10 MB in that time
 
 
+@dataclass(eq=False)
 class Retention:
     """Frees space in the folder of a run whenever the disk has less than `free_bytes` left.
 
@@ -32,17 +34,14 @@ class Retention:
     segments with a track of `flagged()` after all others. Files that are being written are kept.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        free_bytes: int,
-        flagged: Callable[[], Collection[int]],
-        on_notice: Callable[[str], None],
-        on_changed: Callable[[Path], None] = lambda path: None,
-    ) -> None:
-        self._folder, self._free_bytes = folder, free_bytes
-        self._flagged, self._on_notice, self._on_changed = flagged, on_notice, on_changed
+    folder: Path
+    _: KW_ONLY
+    free_bytes: int
+    flagged: Callable[[], Collection[int]]
+    on_notice: Callable[[str], None]
+    on_changed: Callable[[Path], None] = lambda path: None
+
+    def __post_init__(self) -> None:
         self._known: dict[str, tuple[Collection[int], bool]] = {}  # by stem, see `_facts`
         self._stop = Event()
         self._thread = Thread(target=self._watch, name="retention", daemon=True)
@@ -61,18 +60,18 @@ class Retention:
 
         Raises OSError or OutputError if the disk fails.
         """
-        if not self._free_bytes or not self._folder.is_dir():
+        if not self.free_bytes or not self.folder.is_dir():
             return
         done: Counter[str] = Counter()
         steps = self._steps()
-        while free_bytes(self._folder) < self._free_bytes and not self._stop.is_set():
+        while free_bytes(self.folder) < self.free_bytes and not self._stop.is_set():
             if (step := next(steps, None)) is None:
                 break
             done[step] += 1
         if done:
             what = ", ".join(f"{step} of {count}" for step, count in done.items())
-            wanted = f"{self._free_bytes / 1e9:g} GB"
-            self._on_notice(f"less than {wanted} were free, so the oldest recordings went: {what}")
+            wanted = f"{self.free_bytes / 1e9:g} GB"
+            self.on_notice(f"less than {wanted} were free, so the oldest recordings went: {what}")
 
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S):
@@ -81,12 +80,12 @@ class Retention:
 
     def _steps(self) -> Iterator[str]:
         """Delete step by step, and yield the name of each deleted part for the notice."""
-        for table in rotated_files(self._folder / "frames.csv"):
+        for table in rotated_files(self.folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
-        recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
+        recordings = [*self.folder.glob(f"{STEM}-*.mcap"), *self.folder.glob(f"{STEM}-*.rrd")]
         stems = {path.with_suffix("") for path in recordings}
         stems = sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
-        flagged = set(self._flagged())
+        flagged = set(self.flagged())
         has_flagged = {stem: bool(flagged & set(self._facts(stem)[0])) for stem in stems}
         for flag in (False, True):
             group = [stem for stem in stems if has_flagged[stem] is flag]
@@ -109,7 +108,7 @@ class Retention:
     def _remove(self, path: Path, what: str) -> Iterator[str]:
         if path.exists():
             path.unlink()
-            self._on_changed(path)
+            self.on_changed(path)
             yield what
 
     def _thin(self, path: Path) -> Iterator[str]:
@@ -120,7 +119,7 @@ class Retention:
         with suppress(OSError, RecordingError):
             copy, _ = rewrite(path, note=THINNED, edit=partial(_thinned, PhotographChooser()))
             rename_durably(copy, path)
-            self._on_changed(path)
+            self.on_changed(path)
             self._known[path.stem] = tracks, True
             yield "pictures and masks"
 

@@ -5,6 +5,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from itertools import chain
 from pathlib import Path
 from threading import Thread
@@ -123,6 +124,7 @@ _MIN_FREE_SHARE = 0.05  # of `keep_free_gb`: with less than that free only lengt
 _NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths"
 
 
+@dataclass(eq=False)
 class SegmentFiles:
     """Opens, writes and closes the files of segments, given as lists of sinks.
 
@@ -130,28 +132,25 @@ class SegmentFiles:
     are repaired once there is room for the next segment. `on_closed` gets each complete file.
     """
 
-    def __init__(
-        self,
-        out_dir: Path,
-        header: RunHeader,
-        settings: RecordingSettings,
-        *,
-        on_notice: Callable[[str], None],
-        on_closed: Callable[[Path], None],
-        states: SinkStates,
-    ) -> None:
+    out_dir: Path
+    header: RunHeader
+    settings: RecordingSettings
+    _: KW_ONLY
+    on_notice: Callable[[str], None]
+    on_closed: Callable[[Path], None]
+    states: SinkStates
+
+    def __post_init__(self) -> None:
         self.now_ns = 0  # capture time of the last frame, which the caller sets
-        self._out_dir, self._header, self.settings = out_dir, header, settings
-        self.on_notice, self._on_closed, self._states = on_notice, on_closed, states
         self._number = 0
         self.retry_ns = self._refused_ns = 0  # capture times: of the next try, the last refusal
-        self._unfinished = UnfinishedFiles(on_notice=on_notice, on_closed=on_closed)
+        self._unfinished = UnfinishedFiles(on_notice=self.on_notice, on_closed=self.on_closed)
 
     @property
     def is_disk_full(self) -> bool:
         """True if the space left is reserved for lengths; a folder that is away has room."""
         try:
-            free = free_bytes(self._out_dir)
+            free = free_bytes(self.out_dir)
         except OSError:  # open files can still be written to; the next segment reports the problem
             return False
         return free < _MIN_FREE_SHARE * self.settings.keep_free_gb * 1e9
@@ -163,13 +162,13 @@ class SegmentFiles:
             return []
         names: list[Path] = []
         try:
-            with writing_to(self._out_dir):
-                last = last_segment_number(self._out_dir)
+            with writing_to(self.out_dir):
+                last = last_segment_number(self.out_dir)
             number = 1 + max(self._number, last)  # a torn file keeps its own
             stem = f"{STEM}-{number:06d}"
-            names = [self._out_dir / f"{stem}{suffix}" for suffix in (".mcap", ".rrd")]
+            names = [self.out_dir / f"{stem}{suffix}" for suffix in (".mcap", ".rrd")]
             sinks = open_recording_files(
-                self._out_dir, self._header, self.settings, stem=stem, segment_number=number
+                self.out_dir, self.header, self.settings, stem=stem, segment_number=number
             )
         except OutputError as error:
             for path in names:
@@ -200,7 +199,7 @@ class SegmentFiles:
         for sink in sinks:
             try:
                 sink.close()
-                self._on_closed(sink.path)
+                self.on_closed(sink.path)
             except OutputError as error:
                 self._give_up(sink, error)
         sinks.clear()
@@ -209,7 +208,7 @@ class SegmentFiles:
         self._unfinished.finish()
 
     def refuse_for_room(self) -> None:
-        self._refuse(f"{self._out_dir}: {_NO_ROOM}")
+        self._refuse(f"{self.out_dir}: {_NO_ROOM}")
 
     def _refuse(self, reason: str) -> None:
         self.retry_ns = self.now_ns + _RETRY_NS
@@ -217,14 +216,14 @@ class SegmentFiles:
         self.on_notice(reason)
 
     def _give_up(self, sink: FileSink, error: OutputError, outlook: str = "") -> None:
-        self._states.report(f"{STEM}-*{sink.path.suffix}", str(error))
+        self.states.report(f"{STEM}-*{sink.path.suffix}", str(error))
         self.on_notice(f"{error}{outlook}")
         self._unfinished.add(sink.path)
 
     def _report(self, error: str = "") -> None:
         for suffix, is_wanted in ((".mcap", self.settings.mcap), (".rrd", self.settings.rrd)):
             if is_wanted:
-                self._states.report(f"{STEM}-*{suffix}", error)
+                self.states.report(f"{STEM}-*{suffix}", error)
 
 
 def last_segment_number(out_dir: Path) -> int:

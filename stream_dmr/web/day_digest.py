@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
@@ -211,6 +212,7 @@ def _pictures(
                 yield f"pictures/{track_id}.webp", webp.tobytes()
 
 
+@dataclass(eq=False)
 class DailyDigests:
     """Writes the digest of each day of a run when it is over, in a thread of its own.
 
@@ -219,19 +221,15 @@ class DailyDigests:
     its fish came later, such as a fish that a crash interrupted.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        store: LengthStore,
-        signer: Signer,
-        now_ns: Callable[[], int],
-        *,
-        problems: Callable[[], Sequence[str]],
-        on_notice: Callable[[str], None],
-    ) -> None:
-        """`now_ns`: time up to which all is measured, since 1970. `problems`: of the run."""
-        self._folder, self._store, self._signer = folder, store, signer
-        self._now_ns, self._problems, self._on_notice = now_ns, problems, on_notice
+    folder: Path
+    store: LengthStore
+    signer: Signer
+    now_ns: Callable[[], int]  # time up to which all is measured, since 1970
+    _: KW_ONLY
+    problems: Callable[[], Sequence[str]]  # of the run
+    on_notice: Callable[[str], None]
+
+    def __post_init__(self) -> None:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="digests", daemon=True)
         self._thread.start()
@@ -243,22 +241,22 @@ class DailyDigests:
 
     def write_due(self) -> None:
         """Write the missing digests of past days. Raises OutputError."""
-        out, today = self._store.path.parent, _day_of(self._now_ns() - _SETTLE_NS)
-        events = read_rows(self._store.path, EVENTS)
+        out, today = self.store.path.parent, _day_of(self.now_ns() - _SETTLE_NS)
+        events = read_rows(self.store.path, EVENTS)
         written = {row["text"] for row in events if row["kind"] == _WRITTEN}
-        for day, count in sorted(_days(self._store.path)[0].items()):
-            path, text = self._folder / digest_name(day), f"digest of {day}: {count} fish"
+        for day, count in sorted(_days(self.store.path)[0].items()):
+            path, text = self.folder / digest_name(day), f"digest of {day}: {count} fish"
             if day >= today or text in written or self._ended.is_set():
                 continue
-            make_folder(self._folder)
+            make_folder(self.folder)
             require_writable(path, is_own=is_made_by("digest"))
-            problems = self._problems() if day == today - timedelta(days=1) else ()
-            write_digest(out, day, path, self._signer, problems=problems, stop=self._ended)
-            self._store.note(_WRITTEN, text, timestamp_ns=self._store.last_ns)
+            problems = self.problems() if day == today - timedelta(days=1) else ()
+            write_digest(out, day, path, self.signer, problems=problems, stop=self._ended)
+            self.store.note(_WRITTEN, text, timestamp_ns=self.store.last_ns)
 
     def _watch(self) -> None:
         while not self._ended.wait(_LOOK_S):
             try:
                 self.write_due()
             except Exception as error:  # measuring continues
-                self._on_notice(f"[digest] could not be written, tried again later: {error}")
+                self.on_notice(f"[digest] could not be written, tried again later: {error}")

@@ -5,7 +5,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -54,43 +54,35 @@ class MeasuredFrame:
     lengths_mm: dict[int, float]  # the running estimates, by track id
 
 
+@dataclass(eq=False)
 class RunState:
-    """Takes every message in the chain's threads; the server reads it in its own. Thread-safe."""
+    """Takes every message in the chain's threads; the server reads it in its own. Thread-safe.
 
-    def __init__(
-        self,
-        source: Source,
-        out_dir: Path,
-        *,
-        silence_s: float,
-        stuck_s: float,
-        sinks: SinkStates | None = None,
-        zones: ZonesSettings | None = None,
-        positions: PositionSource | None = None,
-        hauls: HaulLog | None = None,
-        scale_alarm: Callable[[], str] = str,
-        store: LengthStore | None = None,
-    ) -> None:
-        """Problems are a camera silent for `silence_s`, and a frame in work for `stuck_s`.
+    Problems are a camera silent for `silence_s`, a frame in work for `stuck_s`, the line of
+    `scale_alarm`, after a wrong measurement of a known length, and a `store` whose file or folder
+    was moved, also while no frames come.
+    """
 
-        Further problems are the line of `scale_alarm`, after a wrong measurement of a known length,
-        and a `store` whose file or folder was moved, also while no frames come.
-        """
-        self.source = source
-        self.positions, self.hauls = positions, hauls
+    source: Source
+    out_dir: Path
+    _: KW_ONLY
+    silence_s: float
+    stuck_s: float
+    sinks: SinkStates = field(default_factory=SinkStates)
+    zones: ZonesSettings = field(default_factory=ZonesSettings)
+    positions: PositionSource | None = None
+    hauls: HaulLog | None = None
+    scale_alarm: Callable[[], str] = str
+    store: LengthStore | None = None
+
+    def __post_init__(self) -> None:
         self.position: Position | None = None  # the latest
         self.chain: Chain | None = None
-        self.sinks = sinks or SinkStates()
         self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
         self.num_fish: Counter[str] = Counter()  # finished fish, by status
         self.species: Counter[str] = Counter()  # of finished fish, by code
         self.fates: Counter[str] = Counter()
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
-        self.zones = zones or ZonesSettings()
-        self._out_dir = out_dir
-        self._silence_s = silence_s
-        self._stuck_s = stuck_s
-        self._scale_alarm, self._store = scale_alarm, store
         self._began_s = time.monotonic()
         self._lock = threading.Lock()
         self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
@@ -187,7 +179,7 @@ class RunState:
     def disk_free_bytes(self) -> int:
         """Free space in the folder of results; 0 if the folder is missing."""
         try:
-            return shutil.disk_usage(self._out_dir).free
+            return shutil.disk_usage(self.out_dir).free
         except OSError:
             return 0
 
@@ -195,21 +187,21 @@ class RunState:
         """The reasons why this run is unhealthy, for people; empty if it is healthy."""
         problems: list[str] = []
         age_s = self.last_frame_age_s()
-        if age_s is not None and age_s > self._silence_s:
+        if age_s is not None and age_s > self.silence_s:
             problems.append(f"no picture from the camera for {age_s:.0f} s")
         if self.is_stuck():
             problems.append("the measurement hangs")
         if self.positions is not None:
             problems += self.positions.problems()
-        if alarm := self._scale_alarm():
+        if alarm := self.scale_alarm():
             problems.append(alarm)
-        if self._store is not None and (lost := self._store.lost):
-            self.sinks.report(self._store.path.name, lost)
+        if self.store is not None and (lost := self.store.lost):
+            self.sinks.report(self.store.path.name, lost)
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:
         """True if a stage has worked on the same frame for more than `stuck_s`."""
-        return self.chain is not None and self.chain.longest_busy_s() > self._stuck_s
+        return self.chain is not None and self.chain.longest_busy_s() > self.stuck_s
 
     def _finish(self, estimate: LengthEstimate) -> None:
         self.finished.append(estimate)
