@@ -66,7 +66,7 @@ class AnnotatedBox:
     species: str = ""
     ends_px: Float[np.ndarray, "2 2"] | None = None
     is_relative: bool = False  # of YOLO: the box is in shares of the frame's width and height
-    check_size: Callable[[tuple[int, int]], None] | None = None  # as `mask`, of COCO
+    check_size: Callable[[tuple[int, int]], None] | None = None  # as `mask`, of COCO and CVAT
 
     def in_px(self, width: int, height: int) -> "AnnotatedBox":
         """The box in a frame of a size. AnnotationError if the file means pictures of another."""
@@ -298,11 +298,13 @@ def parse_cvat(
 def _track_boxes(
     root: ET.Element, path: Path, pictures: Sequence[Path]
 ) -> Iterator[tuple[str, int, AnnotatedBox]]:
+    size = root.find("meta//original_size")  # of a video
+    video = {} if size is None else {side.tag: side.text or "" for side in size}
     for track in root.iter("track"):
         for box in track.iter("box"):
             where = f"{path}, track {track.get('id')}, frame {box.get('frame')}"
             if box.get("outside") != "1":
-                yield _box(box, box.get("frame"), track.get("id"), where)
+                yield _box(box, box.get("frame"), track.get("id"), video, where)
     images = [*root.iter("image")]
     names = {number: image.get("name", "") for number, image in enumerate(images)}
     frames = frames_by_name(names, pictures, where=path)
@@ -310,12 +312,17 @@ def _track_boxes(
         where = f"{path}, image {image.get('id')}"
         frame = str(frames[number] - 1) if frames else image.get("id")
         for box in image.iter("box"):
-            yield _box(box, frame, None, where)
+            yield _box(box, frame, None, image.attrib, where)
 
 
 def _box(
-    element: ET.Element, frame: str | None, track: str | None, where: str
+    element: ET.Element,
+    frame: str | None,
+    track: str | None,
+    picture: Mapping[str, str],
+    where: str,
 ) -> tuple[str, int, AnnotatedBox]:
+    """`picture` may have its width and height."""
     try:
         x0, y0, x1, y1 = (float(element.attrib[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
         frame_index = int(frame or "") + 1
@@ -325,8 +332,13 @@ def _box(
             f"{where}: expected a frame's number and a box with xtl, ytl, xbr, ybr, "
             f"got {element.attrib}"
         ) from None
-    box = box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where)
-    return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box)
+    size = {name: int(text) for name, text in picture.items() if text.isdecimal()}
+    box = AnnotatedBox(
+        track_id=track_id,
+        bbox_xyxy_px=box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where),
+        check_size=partial(require_size, size, where=where),
+    )
+    return where, frame_index, box
 
 
 _VIAME_HEAD = "# 1: Detection or Track-id"

@@ -124,7 +124,7 @@ def decode_coco(
 
 
 def require_size(image: Mapping[str, Any], shape: tuple[int, int], *, where: str) -> None:
-    """Raise AnnotationError if COCO's `image` says another size than the picture's shape.
+    """Raise AnnotationError if the `image` of a file says another size than the picture's shape.
 
     Its boxes and polygons are then of another scale, or of a picture that was turned.
     """

@@ -34,3 +34,22 @@ def test_files_of_another_kind_are_refused(text: str, expected: str):
         parse_cvat(text, PATH)
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+_PICTURE = (
+    f"<annotations><image id='0' name='e.png' width='64' height='48'>"
+    f"<box label='fish' {cvat_corners(1, 2, 30, 40)}/></image></annotations>"
+)
+_VIDEO = cvat_video([(1, 1, 5, 5, 20, 5)]).replace(
+    "</version>",
+    "</version><meta><job><original_size><width>64</width><height>48</height></original_size>"
+    "</job></meta>",
+)
+
+
+@pytest.mark.parametrize("text", [_PICTURE, _VIDEO])
+def test_boxes_of_pictures_of_another_size_are_refused(text: str):
+    (box,) = parse_cvat(text, PATH)[1]
+    assert box.in_px(64, 48) is box
+    with pytest.raises(AnnotationError, match="got those of 64x48 px"):
+        box.in_px(128, 96)
