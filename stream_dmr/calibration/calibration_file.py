@@ -15,7 +15,7 @@ from stream_dmr.calibration.calibration_values import CALIBRATE, read_values, re
 from stream_dmr.calibration.lens_file import lens_of, load_lens, read_array, with_common_names
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError
-from stream_dmr.files import writing_to
+from stream_dmr.files import replacing
 
 _PLANE_KEYS = ("rvec", "tvec")
 _LENS_KEYS = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
@@ -83,8 +83,8 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
         storage.write("distortion_model", "fisheye")
     storage.write("rvec", rvec.reshape(3, 1))
     storage.write("tvec", plane.translation_mm.reshape(3, 1))
-    with writing_to(path):
-        path.write_text(storage.releaseAndGetString(), encoding="utf-8")
+    with replacing(path) as draft:  # a full disk leaves the calibration that was there
+        draft.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
 def require_size(calibration: Calibration, *, width: int, height: int) -> None:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.exchange.ply import export_ply
 
 from stream_dmr.errors import TemplateError, reason_of
-from stream_dmr.files import read_text, writing_to
+from stream_dmr.files import make_folder, read_text, replacing
 from stream_dmr.template.fish_outline import find_points
 from stream_dmr.template.mesh_repair import repair_mesh
 from stream_dmr.template.template import JOINTS, Template, canonical_template
@@ -86,10 +87,10 @@ def save_template(template: Template, path: Path, *, comment: str) -> None:
         if template.total_per_fork is not None:
             lines.append(f"total_per_fork = {template.total_per_fork}")
     mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
-    with writing_to(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        mesh.export(path)
+    make_folder(path.parent)
+    with replacing(path.with_suffix(".toml")) as toml, replacing(path) as draft:
+        toml.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        draft.write_bytes(export_ply(mesh))
 
 
 def bundled_names() -> list[str]:

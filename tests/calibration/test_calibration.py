@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.calibration.calibration_file import load_calibration, require_size, save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
+from tests.support.small_disk import file_size_limit
 from tests.test_camera import cameras, planes
 
 GOOD = {
@@ -189,3 +190,12 @@ def test_aliases_are_refused_before_they_fill_the_memory(tmp_path):
     path.write_text("camera_matrix: &x [*x, *x, *x]\nimage_width: 640\n")
     with pytest.raises(CalibrationError, match="file that begins with"):
         load_calibration(path)
+
+
+def test_a_full_disk_leaves_the_calibration_that_was_there(tmp_path):
+    path = write(tmp_path / "c.yaml")
+    before = path.read_bytes()
+    with file_size_limit(100), pytest.raises(OutputError, match="too large"):
+        save_calibration(path, load_calibration(path))
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["c.yaml"]

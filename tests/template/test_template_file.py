@@ -5,10 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from stream_dmr.errors import TemplateError
+from stream_dmr.errors import OutputError, TemplateError
 from stream_dmr.template.template import canonical_template
 from stream_dmr.template.template_file import load_template, save_template
 from tests.support.shapes import POINTS, fish_mesh, fish_template
+from tests.support.small_disk import file_size_limit
 from tests.support.template_files import toml, write_fish
 
 
@@ -185,3 +186,11 @@ class TestRefusals:
     @pytest.mark.parametrize("name", ["herring", "no/such/mesh.ply", "."])
     def test_unknown_name(self, name):
         self.assert_refused(name, "one of bream, cod, eel, halibut, pike, salmon, spadefish, tuna;")
+
+
+def test_a_full_disk_leaves_the_template_that_was_there(tmp_path):
+    save_template(fish_template(), tmp_path / "own.ply", comment="a test's")
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with file_size_limit(1000), pytest.raises(OutputError, match="too large"):
+        save_template(fish_template(), tmp_path / "own.ply", comment="another")
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

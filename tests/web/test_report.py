@@ -9,17 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
-from stream_dmr.errors import SourceError
+from stream_dmr.errors import OutputError, SourceError
 from stream_dmr.messages import FittedMesh, LocalizedFish
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.verdicts import Verdict, add_verdict
+from stream_dmr.web import open_reports
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.views import draw_views, read_tracks
 from tests.support.browser import evaluate
 from tests.support.command import invoke, rows
 from tests.support.fish_run import measure, request
+from tests.support.small_disk import file_size_limit
 from tests.support.tiny_clip import write_clip
 
 
@@ -221,3 +223,14 @@ def test_thousands_of_fish_are_few_rows(page: Path):
     )
     assert shown["most"] < 30
     assert 990 < int(shown["middle"]) <= 1001
+
+
+def test_a_full_disk_leaves_the_report_that_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    page = tmp_path / "report.html"
+    page.write_text("before")
+    monkeypatch.setattr(open_reports, "render_page", lambda *_, **__: "x" * 1000)
+    with file_size_limit(100), pytest.raises(OutputError, match="too large"):
+        open_reports.write_report([], page, title="")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(page.name, "before")]

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.files import make_folder, replacing, writing_to
+from stream_dmr.files import make_folder, replacing
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures
 from stream_dmr.recording.reading import (
     decoded_messages,
@@ -81,8 +81,8 @@ def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
         viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
         viewer.open([rrd])
         _go_to(viewer, frame_index)
-        with writing_to(png):
-            png.write_bytes(_settled_picture(viewer))
+        with replacing(png) as draft:
+            draft.write_bytes(_settled_picture(viewer))
 
 
 def _go_to(viewer: ViewerClient, frame_index: int) -> None:
