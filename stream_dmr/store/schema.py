@@ -415,6 +415,8 @@ def _refusal(path: Path, error: sqlite3.Error | OSError, *, remedy: str) -> Outp
     # The lower byte is the error, the rest its details.
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_IOERR) & 0xFF
     kind = DiskRefusal if code in _DISK_ERRORS else OutputError
+    if code == sqlite3.SQLITE_FULL:  # another database would find no room either
+        remedy = "make room or choose another --out"
     return kind(f"{path}: expected a database of lengths, got: {error}; {remedy}")
 
 

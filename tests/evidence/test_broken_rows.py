@@ -156,3 +156,12 @@ def test_unsigned_files_and_the_run_are_named(signed: Path, out: Path):
     assert "not signed by the device: 'fish.csv', 'template.ply'" in found.out
     assert "vessel 'Sea Bird', source 'video.mp4'" in found.out
     assert "2 fish" in found.out
+
+
+def test_runs_that_can_t_be_told_are_told_in_words(tmp_path: Path):
+    with closing(sqlite3.connect(tmp_path / "lengths.db")) as database:
+        database.execute("PRAGMA user_version = 0")
+        database.execute("VACUUM")
+    said = invoke("verify", {str(tmp_path): None}).out
+    assert "has no tables" in said
+    assert "its runs can't be told, for the reason above" in said

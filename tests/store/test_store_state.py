@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from stream_dmr.store import schema
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import ScaleCheck, add_check
 from stream_dmr.store.schema import check_lines, open_for_reading, read_state
@@ -63,3 +64,16 @@ def test_checks_are_lines_that_only_grow(folder: Path):
         assert isinstance(more, list)
         assert (more[:count], len(more)) == (lines, count + 1)
         lines = more
+
+
+def test_on_a_full_disk_it_is_room_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def fill(*_: object, **__: object) -> None:
+        with closing(sqlite3.connect(":memory:")) as database:
+            database.execute("PRAGMA max_page_count = 1")
+            database.execute("CREATE TABLE fish (number)")
+
+    monkeypatch.setattr(schema, "_opened", fill)
+    with pytest.raises(schema.DiskRefusal, match="full; make room or choose another --out"):
+        schema.open_for_writing(tmp_path / "lengths.db")
