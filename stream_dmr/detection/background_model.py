@@ -271,7 +271,8 @@ class BackgroundModel:
 
 def _wide_median(plane: UInt8[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
     """Medians over windows of four times `window_px`, from a picture of a quarter of the size."""
-    small = cv2.resize(plane, None, fx=0.25, fy=0.25)
+    is_tiny = min(plane.shape) < 3  # a quarter of it is no pixel
+    small = plane if is_tiny else cv2.resize(plane, None, fx=0.25, fy=0.25)
     return cv2.resize(cv2.medianBlur(small, window_px), plane.shape[::-1]).astype(np.float32)
 
 

@@ -38,6 +38,7 @@ class VideoFile(Source):
         self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
+        self._is_avi = start[:4] == b"RIFF"
         self._decoder = open_decoder(path)
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
@@ -122,11 +123,13 @@ class VideoFile(Source):
     def _warn_if_cut_off(self, num_read: int, *, last_ns: int) -> None:
         """Containers without a frame count promise duration x rate, which may be 1 too many.
 
-        Matroska has no count; at a variable rate any number of frames may be all of a duration.
+        Matroska has no count; at a variable rate any number of frames may be all of a duration. An
+        AVI counts the frames that its camera dropped, and leaves a gap in time for them.
         """
         if self._is_closed or not self.num_frames:
             return
-        if self._is_matroska and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
+        has_gaps = self._is_matroska or self._is_avi
+        if has_gaps and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
             self.num_frames = num_read
         if num_read < self.num_frames - 1:
             self.is_cut_off = True
@@ -225,7 +228,8 @@ class SeekableVideo:
     """
 
     def __init__(self, path: Path) -> None:
-        self._capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        self._opens = (str(path.resolve()), cv2.CAP_FFMPEG)
+        self._capture = cv2.VideoCapture(*self._opens)
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         # Half a frame; the rate of a film with pauses is a mean of all, and of no use.
         half_ms = 500.0 / fps if 1e-3 < fps < 1e6 else 1.0
@@ -239,8 +243,10 @@ class SeekableVideo:
         with self._lock:
             if not self._next_ms - self._tolerance_ms <= wanted_ms <= self._next_ms + _AHEAD_MS:
                 at_ms = self._seek(wanted_ms - _LEAD_MS)
-                if at_ms > wanted_ms + self._tolerance_ms:  # FFmpeg searches by the mean rate
-                    at_ms = self._seek(0.0)
+                # FFmpeg searches by the mean rate, and finds nothing in a file of one picture.
+                if at_ms > wanted_ms + self._tolerance_ms:
+                    self._capture.open(*self._opens)
+                    at_ms = self._grab()
             else:
                 at_ms = self._grab()
             while at_ms <= wanted_ms + self._tolerance_ms:

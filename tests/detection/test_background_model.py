@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.detection.background_model import BackgroundModel
+from stream_dmr.detection.background_model import BackgroundModel, _wide_median
 
 HEIGHT, WIDTH = 96, 128
 EVERYWHERE = np.ones((HEIGHT, WIDTH), np.float32)
@@ -177,3 +177,9 @@ def test_the_model_moves_with_the_view_and_fills_what_comes_into_it():
     np.testing.assert_array_equal(model.mean[:, :-3, 5:], before[:, 3:, :-5])
     np.testing.assert_array_equal(model.mean[:, -3:], picture[:, -3:])
     np.testing.assert_array_equal(model.mean[:, :, :5], picture[:, :, :5])
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (1, 40), (40, 2)])
+def test_a_plane_of_few_pixels_has_a_median(shape: tuple[int, int]):
+    plane = np.full(shape, 7, np.uint8)
+    np.testing.assert_array_equal(_wide_median(plane, 5), plane)

@@ -45,3 +45,8 @@ def test_a_time_outside_of_the_video_has_no_picture(tmp_path: Path):
     assert video.image_at(10**10) is None
     assert video.image_at(0) is not None  # a search after the end finds the start again
     assert SeekableVideo(tmp_path / "none.mp4").image_at(0) is None
+
+
+def test_the_one_picture_of_a_video_can_be_had_again(tmp_path: Path):
+    video = SeekableVideo(write_video(tmp_path / "a.mp4", codec="mp4v", num_frames=1))
+    assert all(video.image_at(0) is not None for _ in range(3))

@@ -7,6 +7,7 @@ from collections import deque
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -247,3 +248,32 @@ def test_ffmpeg_is_told_to_be_quiet_in_this_process():
     code = "import os, stream_dmr.sources.video_file; print(os.environ['OPENCV_FFMPEG_LOGLEVEL'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "-8"
+
+
+def test_frames_that_the_camera_of_an_avi_dropped_are_no_damage(tmp_path):
+    path = write_avi_with_gaps(tmp_path / "a.avi", num_frames=30)
+    opened, frames = read(path)
+    assert [f.timestamp_ns for f in frames[:3]] == [0, *(round(k * SECOND_NS / 15) for k in (2, 3))]
+    assert (len(frames), opened.num_frames, opened.warnings, opened.is_cut_off) == (
+        20,
+        20,
+        [],
+        False,
+    )
+    opened, _ = read(cut(path))
+    assert opened.is_cut_off
+
+
+def write_avi_with_gaps(path, *, num_frames):
+    """One frame in three is missing, so that the file counts more than it holds."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mjpeg", rate=15)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        stream.codec_context.time_base = Fraction(1, 15)
+        for k in range(num_frames):
+            if k % 3 != 1:
+                frame = av.VideoFrame.from_ndarray(noise(k), format="bgr24")
+                frame.pts = k
+                file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    return path
