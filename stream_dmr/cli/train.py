@@ -89,7 +89,12 @@ def evaluate(
 ) -> None:
     """Compare measured lengths with known ones: fish by fish, as intervals, as distributions."""
     from stream_dmr.cli.terminal import print_distributions, print_evaluation
-    from stream_dmr.evaluation.compare import evaluate, evaluate_histogram, plot_histograms
+    from stream_dmr.evaluation.compare import (
+        evaluate,
+        evaluate_histogram,
+        plot_histograms,
+        unit_of_truth,
+    )
     from stream_dmr.evaluation.length_tables import is_histogram
     from stream_dmr.evidence.own_files import is_made_by, require_writable
     from stream_dmr.pipeline.config import load_config
@@ -104,6 +109,8 @@ def evaluate(
     else:
         evaluation = evaluate(lengths, truth, settings=settings)
         print_evaluation(evaluation)
+        if unit := unit_of_truth(evaluation):
+            warn([f"{truth}: expected length_mm in mm, got what seems to be {unit}; convert it"])
         distributions = evaluation.distributions
     if distributions is None:
         print("no histograms: no measured or no true length within the bins of [evaluate]")

@@ -96,6 +96,18 @@ def evaluate(
     return compare(lengths, truth, settings=settings)
 
 
+_UNITS_MM = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
+_NEAR_UNIT = 1.2  # no fish is measured wrong by eight times; chosen
+
+
+def unit_of_truth(evaluation: Evaluation) -> str | None:
+    """The unit in which the truth seems to be by what was measured; None: mm, or nothing known."""
+    ratios = [fish.length_mm / fish.truth_mm for fish in evaluation.fish if fish.length_mm]
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    near = [unit for unit, mm in _UNITS_MM.items() if 1 / _NEAR_UNIT < ratio / mm < _NEAR_UNIT]
+    return near[0] if near else None
+
+
 def _some(ids: Iterable[int], most: int = 5) -> str:
     first = [str(i) for i in ids]
     return ", ".join(first[:most]) + (", ..." if len(first) > most else "")
@@ -114,7 +126,11 @@ def evaluate_histogram(
     predicted = length_histogram(lengths_mm, known.histogram.edges_mm)
     if predicted is None:
         low, high = known.histogram.edges_mm[[0, -1]]
-        raise UserError(f"{lengths_csv}: expected lengths from {low:g} to {high:g} mm, got none")
+        got = f"{lengths_mm.min():.0f} to {lengths_mm.max():.0f} mm" if lengths_mm.size else "none"
+        raise UserError(
+            f"{lengths_csv}: expected lengths from {low:g} to {high:g} mm, got {got}; check that "
+            f"the bins of {histogram_csv} are in mm"
+        )
     truth = known.histogram
     if known.is_shares:
         truth = Histogram(edges_mm=truth.edges_mm, counts=truth.shares * predicted.counts.sum())

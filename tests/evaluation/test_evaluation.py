@@ -180,7 +180,10 @@ def test_a_histogram_of_the_truth_says_the_same_as_the_truth(tmp_path):
         ("bin_low_mm,bin_high_mm,count\n500,600,1\n650,700,1\n", "line 3: expected a bin from 600"),
         ("bin_low_mm,bin_high_mm,count\n500,600,-1\n", "line 2: expected count from 0 on, got -1"),
         ("bin_low_mm,bin_high_mm,count\n500,600,\n", "line 2: expected a number as count"),
-        ("bin_low_mm,bin_high_mm,count\n100,200,3\n", "expected lengths from 100 to 200 mm"),
+        (
+            "bin_low_mm,bin_high_mm,count\n10,200,3\n",
+            "expected lengths from 10 to 200 mm, got 582 to 707 mm; check that the bins of",
+        ),
     ],
 )
 def test_bad_histograms_are_refused_in_one_line(tmp_path, histogram, message):
@@ -231,3 +234,12 @@ def test_a_picture_that_can_t_be_written_is_an_error_where_it_was_asked_for(tmp_
     found = evaluate(tmp_path / "a.csv", tmp_path / "b.csv").distributions
     with pytest.raises(OutputError, match=r"a\.fish"):
         plot_histograms(tmp_path / "a.fish", found)
+
+
+@pytest.mark.parametrize(
+    ("truth", "unit"),
+    [("1,70\n4,60", "cm"), ("1,27.6\n4,23.6", "inches"), ("1,0.7\n4,0.6", "m"), ("1,300", None)],
+)
+def test_a_truth_in_another_unit_is_said(tmp_path, truth, unit):
+    said = run_evaluate(tmp_path, f"track_id,length_mm\n{truth}\n").err
+    assert f"got what seems to be {unit};" in said if unit else not said
