@@ -12,6 +12,7 @@ import typer
 
 from stream_dmr.batch.manifest import COLUMNS, MORE_COLUMNS
 from stream_dmr.cli.shared_options import stop_on_signals, warn
+from stream_dmr.errors import UserError
 from stream_dmr.pipeline.run_options import ConfigOption, KeyOption, TemplateOption
 
 if TYPE_CHECKING:
@@ -53,6 +54,16 @@ def batch(
     Writes --out/videos/NAME (as `run` does), videos.csv (what became of each) and dataset (Parquet:
     a row per fish, a row per fish and frame). A video that can't be measured fails alone.
     """
+    of_other = (
+        {"--address": address, "--gpus": gpus} if engine == "local" else {"--workers": workers}
+    )
+    for option, value in of_other.items():
+        if value:
+            other = "ray" if engine == "local" else "local"
+            raise UserError(
+                f"{option}: expected with --engine {other} alone, got {value} with {engine}; "
+                "leave it out"
+            )
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch
         from stream_dmr.batch.manifest import read_manifest, repeated_videos

@@ -79,6 +79,10 @@ def calibrate(
 
     if model not in ("auto", "pinhole", "fisheye"):
         raise UserError(f"--model: expected auto, pinhole or fisheye, got {model}")
+    if camera is not None and lens is None:
+        raise UserError(
+            f"--camera: expected with --lens alone, got {camera} without it; leave it out"
+        )
     if ends is not None or length_mm is not None or focal_35mm is not None:
         if ends is None or length_mm is None or images or (lens is None) == (focal_35mm is None):
             raise UserError(

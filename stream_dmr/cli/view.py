@@ -50,7 +50,16 @@ def view(
     from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.recording.rerun import viewer
 
+    if screenshot is None and frame is not None:
+        raise UserError(f"--frame: expected with --screenshot alone, got {frame}; leave it out")
+    if port and not web:
+        raise UserError(f"--port: expected with --web alone, got {port}; add --web")
     if screenshot is not None:
+        if screenshot.suffix.lower() != ".png":
+            raise UserError(
+                f"--screenshot {screenshot}: expected a name for a .png, got {screenshot.name}; "
+                "end it in .png"
+            )
         require_writable(screenshot, overwrite=overwrite)
     for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with this
         signal.signal(number, lambda number, _: sys.exit(128 + number))

@@ -287,3 +287,21 @@ def test_setup_speaks_of_compiling_where_it_compiles(
     outcome = invoke("setup")
     assert (outcome.code, outcome.out) == (0, "ready, after 0 s\n")
     assert outcome.err.splitlines() == lines[:1]
+
+
+NOTHING = {
+    "calibrate --plane p.jpg a.jpg --camera left": "--camera: expected with --lens alone",
+    "view REC --frame 3": "--frame: expected with --screenshot alone",
+    "view REC --port 8000": "--port: expected with --web alone",
+    "view REC --screenshot a.jpg": "end it in .png",
+    "batch a.csv --out x --gpus 1": "--gpus: expected with --engine ray alone",
+    "batch a.csv --out x --address auto": "--address: expected with --engine ray alone",
+    "batch a.csv --out x --engine ray --workers 2": "--workers: expected with --engine local alone",
+}
+
+
+@pytest.mark.parametrize("command", NOTHING)
+def test_an_option_that_would_do_nothing_is_refused(command: str):
+    outcome = invoke(command)
+    assert outcome.code == 2
+    assert NOTHING[command] in outcome.error
