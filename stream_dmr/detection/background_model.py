@@ -178,7 +178,7 @@ class BackgroundModel:
         self._size = (width, height)
         self._region_px = max(3, round(_REGION * max(width, height) / _STRIDE)) | 1  # strides
         window_px = max(3, round(_INITIAL_WINDOW * max(width, height) / 4)) | 1
-        self.mean = np.stack([_wide_median(plane, window_px) for plane in picture])
+        self.mean = np.stack([wide_median(plane, window_px) for plane in picture])
         self._age = np.zeros((height, width), np.float32)  # frames learnt; -1: not yet seen
         self._variance_ratio = np.ones((height, width), np.float32)  # over that of the region
         weight = np.ones_like(self._age[_GRID])
@@ -269,7 +269,7 @@ class BackgroundModel:
         return cv2.blur(layers, (self._region_px, self._region_px), borderType=cv2.BORDER_REFLECT)
 
 
-def _wide_median(plane: UInt8[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
+def wide_median(plane: UInt8[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
     """Medians over windows of four times `window_px`, from a picture of a quarter of the size."""
     is_tiny = min(plane.shape) < 3  # a quarter of it is no pixel
     small = plane if is_tiny else cv2.resize(plane, None, fx=0.25, fy=0.25)

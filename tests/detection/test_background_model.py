@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.detection.background_model import BackgroundModel, _wide_median
+from stream_dmr.detection.background_model import BackgroundModel, wide_median
 
 HEIGHT, WIDTH = 96, 128
 EVERYWHERE = np.ones((HEIGHT, WIDTH), np.float32)
@@ -182,4 +182,4 @@ def test_the_model_moves_with_the_view_and_fills_what_comes_into_it():
 @pytest.mark.parametrize("shape", [(2, 2), (1, 40), (40, 2)])
 def test_a_plane_of_few_pixels_has_a_median(shape: tuple[int, int]):
     plane = np.full(shape, 7, np.uint8)
-    np.testing.assert_array_equal(_wide_median(plane, 5), plane)
+    np.testing.assert_array_equal(wide_median(plane, 5), plane)
