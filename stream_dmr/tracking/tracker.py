@@ -30,6 +30,7 @@ _MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
 _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
 _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
+_MIN_PAUSE_NS = 2_000_000_000  # chosen: by then another fish may hang in a fish's place
 _MIN_FRAMES_BESIDE = 3  # in which a newcomer and a fish were seen at once: they are two
 
 
@@ -61,6 +62,8 @@ class Tracker:
         self._tracks: list[Track] = []
         self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
         self._num_started = 0
+        self._last_ns = 0  # capture time of the last frame
+        self._step_ns = 0  # from the frame before to it; 0 before the first
 
     @property
     def is_following(self) -> bool:
@@ -83,7 +86,7 @@ class Tracker:
             for candidate in candidates
             if candidate.score >= self._settings.min_score
         ]
-        if not self._settings.across_frames:
+        if not self._settings.across_frames or self._is_after_pause(frame.timestamp_ns):
             self.forget_tracks()
         for track in (*self._tracks, *self._hidden):
             track.predict(frame.frame_index)
@@ -101,6 +104,13 @@ class Tracker:
         return [
             t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
         ]
+
+    def _is_after_pause(self, timestamp_ns: int) -> bool:
+        """True after a gap in time, as of a camera that films what moves, but not in time-lapse."""
+        before_ns, step_ns = self._step_ns, timestamp_ns - self._last_ns
+        self._last_ns, self._step_ns = timestamp_ns, step_ns
+        longest_ns = max(_MIN_PAUSE_NS, (self._settings.max_lost_frames + 1) * before_ns)
+        return before_ns > 0 and step_ns > longest_ns
 
     def _inside(self, observation: Observation) -> list[Track]:
         """The tracks whose predicted box lies mostly inside an observation's."""

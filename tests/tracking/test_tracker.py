@@ -1,6 +1,7 @@
 """The tracker: numbers are kept through gaps and crossings, and never given twice."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -159,6 +160,23 @@ def test_pictures_that_stand_for_themselves_show_other_fish():
     image = np.zeros((300, 400, 3), np.uint8)
     found = [tracker.step(frame_of(image, i), candidates) for i in range(3)]
     assert [[one.track_number for one in some] for some in found] == [[1, 2], [3, 4], [5, 6]]
+
+
+@pytest.mark.parametrize(
+    ("times_s", "expected"),
+    [
+        ([0, 0.1, 0.2, 60, 60.1], [1, 1, 1, 2, 2]),  # filmed when something moves
+        ([0, 5, 10, 15], [1, 1, 1, 1]),  # time-lapse
+        ([0, 0.1, 1.5], [1, 1, 1]),
+    ],
+)
+def test_after_a_gap_in_time_hangs_another_fish(times_s: list[float], expected: list[int]):
+    tracker, image = Tracker(TrackerSettings()), np.full((300, 400, 3), 90, np.uint8)
+    found = [
+        tracker.step(replace(frame_of(image, i), timestamp_ns=round(t * 1e9)), blobs_of((200, 150)))
+        for i, t in enumerate(times_s, start=1)
+    ]
+    assert [one.track_number for some in found for one in some] == expected
 
 
 def test_a_track_has_the_evidence_of_all_its_frames():
