@@ -34,6 +34,7 @@ _OBSERVATION = [
 ]
 _DWC, _OBIS = "http://rs.tdwg.org/dwc/terms/", "http://rs.iobis.org/obis/terms/"
 _NERC = "http://vocab.nerc.ac.uk/collection/"
+_LENGTH_TERMS = {"total": "TL01XX01", "fork": "FL01XX01"}  # of P01; any other is any length
 
 
 def fish_id(fish: Fish) -> str:
@@ -72,11 +73,10 @@ def measurement_rows(fish: Fish, template: Template) -> list[dict[str, Any]]:
     for kind, (value_mm, source) in found.items():
         converted = f", converted by {source or 'the ratio of its body form'}"
         ci95_mm = _ci95_mm(fish) if kind == given else None
-        term = "TL01XX01" if kind == "total" else "OBSINDLX"  # the total length, or any length
         row = {
             "occurrenceID": fish_id(fish),
             "measurementType": kind if kind == "disc width" else f"{kind} length".strip(),
-            "measurementTypeID": f"{_NERC}P01/current/{term}/",
+            "measurementTypeID": f"{_NERC}P01/current/{_LENGTH_TERMS.get(kind, 'OBSINDLX')}/",
             "measurementValue": f"{value_mm:.1f}",
             "measurementAccuracy": ci95_mm and "95 % interval {:.1f} to {:.1f}".format(*ci95_mm),
             "measurementUnit": "Millimetres",

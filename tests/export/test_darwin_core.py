@@ -50,7 +50,12 @@ def test_each_length_is_a_measurement_with_its_source():
     fork, total = rows["fork length"], rows["total length"]
     assert (fork["measurementValue"], fork["measurementUnit"]) == ("2000.0", "Millimetres")
     assert fork["measurementAccuracy"] == "95 % interval 1992.0 to 2008.0"
-    assert total["measurementTypeID"].endswith("/P01/current/TL01XX01/")
+    codes = [row["measurementTypeID"].split("/")[-2] for row in rows.values()]
+    assert dict(zip(rows, codes, strict=True)) == {
+        "fork length": "FL01XX01",
+        "total length": "TL01XX01",
+        "precaudal length": "OBSINDLX",
+    }
     assert total["measurementAccuracy"] is None  # the equation has an error of its own
     assert "Skomal and Natanson 2003" in total["measurementMethod"]
     (halibut_total,) = (
