@@ -55,12 +55,12 @@ def view(
     if port and not web:
         raise UserError(f"--port: expected with --web alone, got {port}; add --web")
     if screenshot is not None:
+        require_writable(screenshot, overwrite=overwrite)
         if screenshot.suffix.lower() != ".png":
             raise UserError(
                 f"--screenshot {screenshot}: expected a name for a .png, got {screenshot.name}; "
                 "end it in .png"
             )
-        require_writable(screenshot, overwrite=overwrite)
     for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with this
         signal.signal(number, lambda number, _: sys.exit(128 + number))
     selection = parse_selection(time, track)

@@ -131,7 +131,9 @@ class TrackLength:
         std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
         if std_mm > self._settings.max_std_ratio * length_mm:
             return None, None, None
-        if is_final and self._has_drifted(self._filter.frames):
+        # What seems turned just less than a refused frame is as wrong.
+        is_turned = self._refused[Reason.TURNED_AWAY] >= num_used
+        if is_final and (is_turned or self._has_drifted(self._filter.frames)):
             return None, None, None
         share = self._settings.upward_share
         ends_mm = length_mm + _CI95_STDS * std_mm * np.array([share - 1.0, share])

@@ -372,3 +372,16 @@ def test_frames_of_before_say_nothing_of_the_shape():
     frames = [frame(index, 700.0) for index in range(1, 6)]
     zero = run([replace(fish, shared_std_ratio=0.0) for fish in frames])[-1]
     assert run(frames)[-1].length_std_mm == zero.length_std_mm
+
+
+@pytest.mark.parametrize(("turned", "is_measured"), [(4, True), (5, False)])
+def test_a_fish_of_which_as_many_frames_are_turned_away_as_count_gets_no_length(
+    turned, is_measured
+):
+    """The fit may lean a whole fish: frames just within the limit are then as wrong."""
+    frames = [frame(i, 700.0) for i in range(1, 6)]
+    frames += [frame(i, 800.0, reason=Reason.TURNED_AWAY) for i in range(6, 6 + turned)]
+    *running, final = run(frames)
+    assert running[-1].length_mm is not None
+    assert (final.length_mm is not None) == is_measured
+    assert is_measured or final.status == Reason.TOO_UNCERTAIN

@@ -60,7 +60,7 @@ def test_a_report_has_the_fish_and_says_what_is_missing(lost: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(
     "command",
-    ["replay LOST", "replay LOST --check", "review LOST", "view LOST --screenshot NEW"]
+    ["replay LOST", "replay LOST --check", "review LOST", "view LOST --screenshot NEW.png"]
     + [f"export LOST --fish csv --{what} --out NEW" for what in ("masks", "viame", "meshes ply")],
 )
 def test_what_needs_a_recording_is_refused_in_one_line(lost: Path, tmp_path: Path, command: str):
