@@ -18,7 +18,7 @@ from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.web import open_reports
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.views import draw_views, read_tracks
-from tests.support.browser import evaluate
+from tests.support.browser import Tab, evaluate
 from tests.support.command import invoke, rows
 from tests.support.fish_run import measure, request
 from tests.support.small_disk import file_size_limit
@@ -205,6 +205,31 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
     assert "77.7 cm" in shown["second"]
     assert "measured" in shown["second"]
     assert "1\nwith a length, not rejected" in shown["counted"]
+
+
+@pytest.mark.parametrize("width", [1024, 700, 390])
+def test_long_names_and_narrow_windows_cut_nothing(page: Path, width: int):
+    tab = Tab(page.absolute().as_uri(), width=width, height=900)
+    try:
+        tab.run(
+            """
+            const name = 'x'.repeat(300);
+            for (const one of document.querySelectorAll('h1, h2')) one.textContent = name;
+            document.getElementById('notes').append(element('li', { textContent: name }));
+            """
+        )
+        assert tab.cut() == []
+        assert tab.run(
+            """
+            const reason = 'a glove of somebody '.repeat(9);
+            Object.assign(DATA.fish[0], { verdict: 'reject', verdict_reason: reason });
+            show();
+            const row = document.querySelector('.row');
+            return row.querySelector('img').offsetTop >= 0 && row.lastChild.title.includes(reason);
+            """
+        )
+    finally:
+        tab.close()
 
 
 def test_thousands_of_fish_are_few_rows(page: Path):

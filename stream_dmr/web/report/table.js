@@ -108,7 +108,7 @@ function rowOf(fish) {
   const because = fish.verdict_reason ?? (fish.duplicate_of === null ? "" : `${fish.verdict === "merge" ? "into" : "of"} ${fish.duplicate_of}`);
   const species = fish.species === DATA.template ? "" : fish.species;
   const said = [because, species, fish.fate ?? ""].filter(Boolean).map((textContent) => element("small", { textContent }));
-  const verdict = element("span", { textContent: VERDICTS[fish.verdict] ?? "" }, ...said);
+  const verdict = element("span", { textContent: VERDICTS[fish.verdict] ?? "", title: [because, species, fish.fate].filter(Boolean).join(", ") }, ...said);
   if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
