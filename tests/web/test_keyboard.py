@@ -139,6 +139,43 @@ def test_a_missed_fish_is_drawn_measured_and_split(tab: Tab, out: Path):
     assert verify(out)[0] == []
 
 
+def press(tab: Tab, key: str, text: str) -> None:
+    codes = {"key": key, "windowsVirtualKeyCode": ord(text)}
+    tab.send("Input.dispatchKeyEvent", type="keyDown", text=text, **codes)
+    tab.send("Input.dispatchKeyEvent", type="keyUp", **codes)
+
+
+def test_space_and_enter_do_what_the_part_in_focus_is_for(tab: Tab):
+    tab.run(WAIT + "choose(1); await until(() => player.clip?.isDone && player.fish.id === 1);")
+    tab.run("document.getElementById('goes-on').focus()")
+    press(tab, " ", " ")
+    assert tab.run("return document.getElementById('goes-on').checked") is False
+    tab.run("document.querySelector('#head button:nth-child(3)').focus()")
+    press(tab, "Enter", "\r")
+    assert tab.run("return document.activeElement.textContent") == "Length \u2191"
+    tab.run("click('do-add')(); document.getElementById('do-cancel').focus()")
+    press(tab, "Enter", "\r")
+    assert tab.run("return [isDrawing(), document.getElementById('message').textContent]") == [
+        False,
+        "",
+    ]
+
+
+def test_every_field_has_a_name(tab: Tab):
+    assert (
+        tab.run(
+            WAIT
+            + """
+        choose(1);
+        await until(() => document.getElementById("do-accept"));
+        const unnamed = (one) => one.labels.length === 0 && !one.getAttribute("aria-label");
+        return [...document.querySelectorAll("input, select")].filter(unnamed).map((one) => one.id);
+        """
+        )
+        == []
+    )
+
+
 def test_nothing_is_cut_and_clip_and_verdicts_are_in_sight_together(tab: Tab):
     assert tab.run(
         WAIT

@@ -28,9 +28,9 @@ function onKey(event) {
     return event.target.blur();
   }
   if (isTyping || event.ctrlKey || event.altKey || event.metaKey) return;
-  if (event.key === "Enter" && isDrawing()) { event.preventDefault(); return measureDrawn(); }
+  if (event.key === "Enter" && isDrawing() && event.target.id !== "do-cancel") { event.preventDefault(); return measureDrawn(); }
   const known = KEYS.find(([key]) => key === event.key || key === event.key.toLowerCase());
-  if (!known || (event.key === " " && event.target.matches("button"))) return;
+  if (!known || (event.key === " " && event.target.matches("button, summary, [type=checkbox]"))) return;
   event.preventDefault();
   if (event.repeat && !REPEATED.includes(known[0])) return;  // a key that is held judges one fish
   known[2]();

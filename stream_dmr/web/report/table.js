@@ -76,13 +76,14 @@ function sorted(fish) {
 
 function drawHead(onSort) {
   const head = document.getElementById("head");
-  head.replaceChildren(...COLUMNS.map((column, k) => element("span", {
+  head.replaceChildren(...COLUMNS.map((column, k) => column.key === null ? element("span") : element("button", {
+    type: "button",
     textContent: column.title + (k === state.column ? (state.descending ? " \u2193" : " \u2191") : ""),
     onclick: () => {
-      if (column.key === null) return;
       state.descending = k === state.column && !state.descending;
       state.column = k;
       onSort();
+      head.children[k].focus();
     },
   })));
 }
