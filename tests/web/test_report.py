@@ -232,6 +232,31 @@ def test_long_names_and_narrow_windows_cut_nothing(page: Path, width: int):
         tab.close()
 
 
+def test_every_fish_is_on_paper(page: Path):
+    tab = Tab(page.absolute().as_uri(), width=718, height=1000)
+    try:
+        tab.run(
+            "const fish = (_, k) => ({ ...DATA.fish[0], id: k + 1 });"
+            "DATA.fish = Array.from({ length: 60 }, fish); show();"
+        )
+        on_screen = "return document.querySelectorAll('.row').length"
+        assert tab.run(on_screen) < 30
+        tab.send("Emulation.setEmulatedMedia", media="print")
+        rows, hidden_px = tab.run(
+            """
+            dispatchEvent(new Event('beforeprint'));
+            const table = document.getElementById('table');
+            const rows = document.querySelectorAll('.row').length;
+            return [rows, table.scrollHeight - table.clientHeight];
+            """
+        )
+        assert (rows, hidden_px) == (60, 0)
+        tab.send("Emulation.setEmulatedMedia", media="")
+        assert tab.run(f"dispatchEvent(new Event('afterprint')); {on_screen}") < 30
+    finally:
+        tab.close()
+
+
 def test_thousands_of_fish_are_few_rows(page: Path):
     shown = evaluate(
         page,

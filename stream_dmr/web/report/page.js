@@ -57,6 +57,8 @@ document.getElementById("filters").oninput = () => {
 };
 document.getElementById("filters").onsubmit = (event) => event.preventDefault();
 document.getElementById("table").onscroll = () => requestAnimationFrame(() => drawRows(choose));
+addEventListener("beforeprint", () => drawRows(choose, true));
+addEventListener("afterprint", () => drawRows(choose));
 document.getElementById("table").onkeydown = (event) => {
   const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
   if (by) { event.preventDefault(); step(by); }

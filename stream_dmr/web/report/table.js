@@ -88,12 +88,13 @@ function drawHead(onSort) {
   })));
 }
 
-function drawRows(onChoose) {
+// `isWhole`: also those out of sight, for paper.
+function drawRows(onChoose, isWhole = false) {
   const table = document.getElementById("table");
   const rows = document.getElementById("rows");
   rows.style.height = `${state.shown.length * ROW_PX}px`;
-  const first = Math.max(0, Math.floor(table.scrollTop / ROW_PX) - 3);
-  const last = Math.min(state.shown.length, Math.ceil((table.scrollTop + table.clientHeight) / ROW_PX) + 3);
+  const first = isWhole ? 0 : Math.max(0, Math.floor(table.scrollTop / ROW_PX) - 3);
+  const last = isWhole ? state.shown.length : Math.min(state.shown.length, Math.ceil((table.scrollTop + table.clientHeight) / ROW_PX) + 3);
   rows.replaceChildren(...state.shown.slice(first, last).map((fish, k) => {
     const row = rowOf(fish);
     row.style.top = `${(first + k) * ROW_PX}px`;
