@@ -161,6 +161,29 @@ def test_space_and_enter_do_what_the_part_in_focus_is_for(tab: Tab):
     ]
 
 
+def test_a_key_pressed_twice_while_a_verdict_is_saved_decides_once(tab: Tab, out: Path):
+    left = tab.run(
+        WAIT
+        + """
+        choose(1);
+        await until(() => player.clip?.isDone && player.fish.id === 1);
+        const answer = window.fetch;
+        window.fetch = async (...asked) => {
+          await new Promise((done) => setTimeout(done, asked[0] === "verdict" ? 300 : 0));
+          return answer(...asked);
+        };
+        key("a");
+        key("a");
+        const said = message().textContent;
+        await until(() => state.chosen !== 1);
+        await new Promise((done) => setTimeout(done, 900));
+        return [said, state.chosen];
+        """
+    )
+    assert left == ["Saving ...", 2]
+    assert kinds(out) == [(1, "accept")]
+
+
 def test_every_field_has_a_name(tab: Tab):
     assert (
         tab.run(

@@ -49,6 +49,7 @@ function goToNext() {
 // What an undo takes back stands on its button.
 function undoLabel() { return bindKey(DATA.review.undo ? `Undo ${DATA.review.undo}` : "Undo", "u"); }
 
+let deciding = null;  // the fish whose decision is on its way
 let isRefused = false;  // the last act: an undo after it would take back the one before, unseen
 
 function refuse(text) {
@@ -63,6 +64,9 @@ async function send(verdict) {
     isRefused = false;
     return say(`Nothing was saved, so nothing is taken back.${DATA.review.undo && ` Once more takes back: ${DATA.review.undo}.`}`);
   }
+  const decides = DECISIONS.includes(verdict.kind);
+  if (decides && deciding === fish.id && !verdict.sure) return say("Saving ...");  // not a second time
+  if (decides) deciding = fish.id;
   const seenBefore = new Set(DATA.seen);  // `refresh` may bring a new fish before the answer does
   let answered;
   try {
@@ -72,6 +76,8 @@ async function send(verdict) {
     if (answered.question) return confirm(answered.question) ? send({ ...verdict, sure: true }) : refuse("Not saved.");
   } catch {
     return refuse("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
+  } finally {
+    if (decides) deciding = null;
   }
   const { rows, said } = answered;
   isRefused = false;
@@ -79,7 +85,7 @@ async function send(verdict) {
   document.getElementById("do-undo")?.replaceChildren(...undoLabel());
   takeRows(rows);
   show();
-  if (DECISIONS.includes(verdict.kind) && document.getElementById("goes-on").checked) return say(`${said}. ${goToNext()}`);
+  if (decides && document.getElementById("goes-on").checked) return say(`${said}. ${goToNext()}`);
   const wanted = verdict.kind === "add" ? rows.find((row) => !seenBefore.has(row.id)) : verdict.kind === "undo" ? rows.find((row) => !row.gone) : null;
   const shown = wanted ?? chosenFish() ?? DATA.fish[0];
   for (const row of rows) DATA.seen.add(row.id);
