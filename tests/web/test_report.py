@@ -162,10 +162,10 @@ def test_time_begins_at_the_first_frame_and_not_at_the_first_fish(tmp_path: Path
         """
         const plot = document.getElementById('time');
         while (!plot.data) await new Promise((done) => setTimeout(done, 50));
-        return plot.data[1].x;
+        return [plot.data[1].x, plot.layout.xaxis.title.text];
         """,
     )
-    assert times == [pytest.approx(0.3)]
+    assert times == [[pytest.approx(0.3)], "s from the first frame"]
 
 
 def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
@@ -197,6 +197,8 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
         result.backwards = ids();
         result.second = document.querySelector('[data-id="2"]').innerText;
         result.counted = document.getElementById('summary').innerText;
+        const facts = (fish) => factList(fish).innerText;
+        result.facts = [facts(DATA.fish[1]), facts({ ...DATA.fish[1], corrected_length_std_mm: 10 })];
         return result;
         """,
     )
@@ -205,6 +207,10 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
     assert "77.7 cm" in shown["second"]
     assert "measured" in shown["second"]
     assert "1\nwith a length, not rejected" in shown["counted"]
+    assert "standard deviation" not in shown["counted"]  # one fish has none
+    without, with_interval = shown["facts"]
+    assert "77.7 cm, 95 %" not in without
+    assert "77.7 cm, 95 % interval 75.7 to 79.7 cm" in with_interval
 
 
 @pytest.mark.parametrize("width", [1024, 700, 390])

@@ -30,13 +30,18 @@ function viewFigure(view, fish) {
   return figure;
 }
 
+function intervalText(fish) {
+  const interval = intervalOf(fish);
+  return interval && `95 % interval ${interval.map((mm) => cm(mm)).join(" to ")} cm`;
+}
+
 function factList(fish) {
   const run = DATA.runs[fish.run_id] ?? {};
   const reasons = Object.entries(fish.refused).map(([reason, count]) => `${reason} (${count})`).join(", ");
   const legal = fish.is_legal_size === null ? "" : fish.is_legal_size ? "yes" : "no";
   const rows = [
     ["length", fish.length_mm === null ? fish.status : `${cm(fish.length_mm)} cm, 95 % interval ${cm(fish.ci95_low_mm)} to ${cm(fish.ci95_high_mm)} cm`],
-    ["corrected", fish.corrected_length_mm === null ? "" : `${cm(fish.corrected_length_mm)} \u00b1 ${cm(1.96 * fish.corrected_length_std_mm)} cm`],
+    ["corrected", fish.corrected_length_mm === null ? "" : [`${cm(fish.corrected_length_mm)} cm`, intervalText(fish)].filter(Boolean).join(", ")],
     ["fork, total", fish.fork_length_mm === null ? "" : `${cm(fish.fork_length_mm)} cm, ${cm(fish.total_length_mm)} cm`],
     ["whole cm", fish.length_cm ?? ""],
     ["weight", fish.weight_kg === null ? "" : `${fish.weight_kg.toFixed(2)} kg (${fish.weight_source})`],

@@ -66,5 +66,6 @@ document.getElementById("table").onkeydown = (event) => {
 document.getElementById("software").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
 for (const name of ["notes", "shapes"]) document.getElementById(name).replaceChildren(...DATA[name].map((line) => element("li", { textContent: line })));
 show();
+if (!DATA.fish.length) document.querySelector("#detail .hint").textContent = "There is no fish here.";
 if (isReview()) startReview();
 if (location.hash.startsWith("#fish-")) choose(Number(location.hash.slice(6)));

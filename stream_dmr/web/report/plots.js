@@ -21,8 +21,9 @@ function drawSummary(fish) {
   const tiles = [[fish.length, "fish"], [lengths.length, "with a length, not rejected"]];
   if (lengths.length) {
     const mean = lengths.reduce((sum, x) => sum + x, 0) / lengths.length;
-    const sd = lengths.length > 1 ? Math.sqrt(lengths.reduce((sum, x) => sum + (x - mean) ** 2, 0) / (lengths.length - 1)) : 0;
-    tiles.push([`${mean.toFixed(1)} cm`, "mean"], [`${sd.toFixed(1)} cm`, "standard deviation"],
+    const sd = Math.sqrt(lengths.reduce((sum, x) => sum + (x - mean) ** 2, 0) / (lengths.length - 1));
+    tiles.push([`${mean.toFixed(1)} cm`, "mean"],
+      ...(lengths.length > 1 ? [[`${sd.toFixed(1)} cm`, "standard deviation"]] : []),  // of one fish there is none
       [`${quantile(lengths, 0.5).toFixed(1)} cm`, "median"],
       [`${quantile(lengths, 0.25).toFixed(1)} to ${quantile(lengths, 0.75).toFixed(1)} cm`, "25 % to 75 %"],
       [`${lengths[0].toFixed(1)} to ${lengths.at(-1).toFixed(1)} cm`, "shortest to longest"]);
@@ -107,7 +108,7 @@ function drawTime(fish, onChoose) {
     { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.id), text: measured.map((f) => `${f.track_id} ${f.video && `of ${f.video}`}`),
       marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{text}<br>%{y:.1f} cm<extra></extra>" },
   ];
-  const drawn = layout("Fish over time, with 95 % intervals", unit, "cm");
+  const drawn = layout("Fish over time, with 95 % intervals", `${unit} from the first frame`, "cm");
   if (!measured.length) showNoLengths(drawn);
   Plotly.react("time", traces, drawn, PLOT_CONFIG).then((plot) => {
     plot.removeAllListeners("plotly_click");
