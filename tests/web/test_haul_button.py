@@ -98,6 +98,17 @@ def test_a_haul_is_begun_and_ended(server: WatchServer, hauls: HaulLog, width: i
     ]
 
 
+def test_a_haul_that_is_not_noted_is_said(server: WatchServer):
+    tab = Tab(server.address, width=390, height=900)
+    told = "await tellHaul('pause'); return byId('haul-said').textContent"
+    try:
+        assert "pause" in tab.run(told)
+        server.close()
+        assert tab.run(told) == "Nothing was noted: no answer."
+    finally:
+        tab.close()
+
+
 def test_a_running_box_takes_a_haul_as_of_now_alone(server: WatchServer, hauls: HaulLog):
     told = invoke("haul", {"start": None, server.address: None, "--at": "5"})
     assert told.code == 2

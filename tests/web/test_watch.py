@@ -35,7 +35,7 @@ from stream_dmr.web.run_state import RunState
 from stream_dmr.web.token_server import TokenServer
 from stream_dmr.web.watch_observer import JsonLog, SystemdWatchdog, WatchObserver
 from stream_dmr.web.watch_page import WatchServer
-from tests.support.browser import chromium
+from tests.support.browser import Tab, chromium
 from tests.support.camera import free_port
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS
@@ -268,6 +268,28 @@ def test_a_phone_sees_fish_problems_and_warnings(server: WatchServer, state: Run
     assert "lengths.db can't be written: no space left" in dom
     assert "&lt;b&gt;the lens&lt;/b&gt; is dirty (2 times, " in dom
     assert 'src="picture.jpg?' in dom
+
+
+def test_a_box_that_stops_answering_is_said_to(server: WatchServer, state: RunState):
+    state.warn("x" * 300)
+    tab = Tab(server.address, width=390, height=800)
+    until = """
+        for (let k = 0; k < 150 && !byId("state").textContent.startsWith(WANTED); k += 1)
+          await new Promise(done => setTimeout(done, 20));
+        return byId("state").textContent;
+    """
+    try:
+        assert tab.run(until.replace("WANTED", "'Measuring'")) == "Measuring"
+        assert tab.cut() == []
+        tab.run(
+            "const limit = AbortSignal.timeout.bind(AbortSignal);"
+            " AbortSignal.timeout = () => limit(50)"
+        )
+        lost = {"latency": 60_000, "downloadThroughput": -1, "uploadThroughput": -1}
+        tab.send("Network.emulateNetworkConditions", offline=False, **lost)
+        assert tab.run(until.replace("WANTED", "'No answer'")).startswith("No answer")
+    finally:
+        tab.close()
 
 
 class Watcher(RunObserver):
