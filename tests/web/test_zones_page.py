@@ -85,6 +85,41 @@ def test_corners_are_tapped_moved_and_removed(server: WatchServer, width: int):
         tab.close()
 
 
+def test_copying_says_whether_it_copied(server: WatchServer):
+    tab = Tab(f"{server.address}zones", width=390, height=800)
+    try:
+        said = tab.run(
+            WAIT
+            + "navigator.clipboard.writeText = async () => {};"
+            + "await byId('copy').onclick(); const said = byId('copied').textContent;"
+            + "navigator.clipboard.writeText = () => Promise.reject();"
+            + "document.execCommand = () => false;"
+            + "await byId('copy').onclick(); return [said, byId('copied').textContent];"
+        )
+    finally:
+        tab.close()
+    assert said == ["Copied", "Not copied: copy the marked lines by hand"]
+
+
+def test_a_run_without_a_picture_so_far_says_so(tmp_path: Path):
+    (tmp_path / "pictures").mkdir()
+    cv2.imwrite(str(tmp_path / "pictures" / "1.png"), np.zeros((9, 16, 3), np.uint8))
+    source = open_source(str(tmp_path / "pictures"), ReadFramesSettings())
+    state = RunState(source, tmp_path, silence_s=20.0, stuck_s=120.0)
+    served = WatchServer(state, WatchSettings(port=free_port()))
+    tab = Tab(f"{served.address}zones", width=390, height=800)
+    try:
+        said = tab.run(
+            "for (let k = 0; k < 150 && !byId('problem').textContent; k += 1)"
+            " await new Promise(done => setTimeout(done, 20));"
+            "return [byId('problem').textContent, document.querySelector('image') === null];"
+        )
+    finally:
+        tab.close()
+        served.close()
+    assert said == ["No picture so far: open this page again when the run has one.", True]
+
+
 def test_two_corners_are_no_zone_yet(server: WatchServer):
     tab = Tab(f"{server.address}zones", width=390, height=800)
     try:
