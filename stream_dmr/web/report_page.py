@@ -80,6 +80,7 @@ def trip_section(
     heading = _heading(fish, [*runs, *(caught.facts for caught in fish)])
     if not (heading or drawn or any(row["haul"] != "-" for row in rows)):
         return ""
+    heading = heading or "Hauls"  # of several folders, of which nothing else is known
     return render("report/trip.html", heading=heading, rows=rows, map=drawn, is_folded=is_folded)
 
 

@@ -228,9 +228,12 @@ def test_long_names_and_narrow_windows_cut_nothing(page: Path, width: int):
         assert tab.run(
             """
             const reason = 'a glove of somebody '.repeat(9);
-            Object.assign(DATA.fish[0], { verdict: 'reject', verdict_reason: reason });
+            Object.assign(DATA.fish[0], {
+              verdict: 'reject', verdict_reason: reason, video: 'x'.repeat(15) });
             show();
             const row = document.querySelector('.row');
+            const [, number] = row.children;
+            if (number.scrollWidth > number.clientWidth) return false;
             return row.querySelector('img').offsetTop >= 0 && row.lastChild.title.includes(reason);
             """
         )

@@ -61,6 +61,12 @@ def test_hauls_and_vessel_stand_in_the_page(tmp_path: Path):
     assert section in page.read_text(encoding="utf-8")
 
 
+def test_the_section_of_folders_without_a_trip_has_a_heading(tmp_path: Path):
+    report = open_report(measure(tmp_path))
+    assert trip_section([report]) == ""
+    assert "<h2>Hauls</h2>" in trip_section([report, report], is_folded=True)
+
+
 def test_a_haul_without_fish_is_in_the_page_with_its_effort(tmp_path: Path):
     write_clip(tmp_path / "clip", fish=[[]] * 6)
     asked = request(

@@ -117,7 +117,7 @@ function rowOf(fish) {
     "div",
     { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
     fish.thumbnail ? element("img", { src: fish.thumbnail, alt: "", loading: "lazy" }) : element("span"),
-    element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video }), element("small", { textContent: fish.haul && `haul ${fish.haul}` })),
+    element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video, title: fish.video }), element("small", { textContent: fish.haul && `haul ${fish.haul}` })),
     element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
     element("small", { textContent: reasons, title: reasons }),
