@@ -241,6 +241,20 @@ def test_long_names_and_narrow_windows_cut_nothing(page: Path, width: int):
         tab.close()
 
 
+def test_the_open_fish_is_still_open_after_a_reload(page: Path):
+    tab = Tab(page.absolute().as_uri())
+    try:
+        address = tab.run("choose(2); return location.href")
+    finally:
+        tab.close()
+    assert evaluate(page, "return state.chosen") is None
+    tab = Tab(address)
+    try:
+        assert tab.run("return state.chosen") == 2
+    finally:
+        tab.close()
+
+
 def test_every_fish_is_on_paper(page: Path):
     tab = Tab(page.absolute().as_uri(), width=718, height=1000)
     try:

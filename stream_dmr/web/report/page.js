@@ -30,6 +30,7 @@ function choose(id) {
   const fish = DATA.fish.find((one) => one.id === id);
   if (!fish) return;
   state.chosen = id;
+  if (!isReview()) history.replaceState(null, "", `#fish-${id}`);  // where a reload begins; a review goes on
   drawRows(choose);
   const drawn = drawDetail(fish);
   const panel = document.getElementById("detail");
