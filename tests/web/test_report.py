@@ -198,7 +198,8 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
         result.second = document.querySelector('[data-id="2"]').innerText;
         result.counted = document.getElementById('summary').innerText;
         const facts = (fish) => factList(fish).innerText;
-        result.facts = [facts(DATA.fish[1]), facts({ ...DATA.fish[1], corrected_length_std_mm: 10 })];
+        const surer = { ...DATA.fish[1], corrected_length_std_mm: 10 };
+        result.facts = [facts(DATA.fish[1]), facts(surer)];
         return result;
         """,
     )
