@@ -66,18 +66,20 @@ class HaulLog:
     def mark(self, what: str, name: str = "", *, said_by: str) -> str:
         """Begin or end a haul now; returns its name. Raises UserError if that makes no sense."""
         with self._lock:
-            current = self.current()
+            current, timestamp_ns = self.current(), self._now_ns
             if what == START:
                 name = name.strip() or next_name(self.hauls())
             elif what == END and current is not None:
                 name = current.name
+                # By a command it may have begun after the last frame: the camera is silent.
+                timestamp_ns = max(timestamp_ns, current.began_ns + 1)
             else:
                 raise UserError(
                     f"haul: expected start, or end of a haul that goes on, got {what!r}; "
                     "begin one first"
                 )
             self._ruled = None
-            self._add(what, name, self._now_ns, said_by)
+            self._add(what, name, timestamp_ns, said_by)
             return name
 
     def take_frame(self, timestamp_ns: int) -> None:

@@ -11,6 +11,7 @@ from functools import partial
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from stream_dmr.errors import ConfigError, reason_of, requires_extra
 from stream_dmr.files import read_secret
@@ -125,6 +126,12 @@ def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
         if not settings.webhook.startswith(("http://", "https://")):
             raise ConfigError(
                 f"[alerts] webhook: expected http://... or https://..., got {settings.webhook!r}"
+            )
+        if "@" in urlsplit(settings.webhook).netloc:  # urllib takes it for a part of the host
+            raise ConfigError(
+                "[alerts] webhook: expected an address without user:password@, since recordings "
+                "hold the settings, got one with it; put json://user:password@HOST/PATH, for https "
+                "jsons://..., into a file for apprise_file"
             )
         deliveries.append(lambda alert: _post(settings.webhook, alert))
     if settings.apprise_file:

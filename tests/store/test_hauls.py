@@ -91,6 +91,16 @@ def test_a_haul_that_is_begun_again_has_only_its_own_times(tmp_path: Path):
     assert (efforts["7"].began_ns, efforts["7"].ended_ns) == (100 * SECOND, 500 * SECOND)
 
 
+def test_a_haul_that_a_command_began_after_the_last_frame_ends_by_the_button(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings())
+    log.take_frame(100 * SECOND)
+    write_haul(tmp_path, "start", name="7", at="110", said_by="Ada")
+    log.mark("end", said_by="Bo")
+    assert log.current() is None
+    store.close()
+
+
 def test_fish_are_counted_by_fate_with_each_haul(tmp_path: Path):
     store = LengthStore(tmp_path, replace(FACTS, haul="7"))
     fates = ["landed", "unknown", "cut off", "landed", None]

@@ -287,6 +287,9 @@ def test_settings_that_do_not_fit_are_refused(apprise_file: Callable[..., AlertS
     ):
         assert expected in refusal(apprise_file(*lines))
     assert "expected http://" in refusal(AlertSettings(webhook="ftp://example.org"))
+    said = refusal(AlertSettings(webhook="https://box:secret@example.org/hook"))
+    assert "without user:password@" in said
+    assert "secret" not in said
     assert "expected a file with" in refusal(AlertSettings(apprise_file="missing.txt"))
 
 
