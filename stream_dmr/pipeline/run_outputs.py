@@ -284,6 +284,8 @@ def interrupted_tracks(
 ) -> list[LocalizedFish]:
     """The frames of fish that were in view at a crash, from the recordings repaired after it."""
     torn = [repair.path for repair in repairs if repair.path.suffix == ".mcap"]
+    if not torn and store.was_cut_off():  # `recover` repaired them, or a segment had just ended
+        torn = _segments(store.path.parent, "mcap")[:1]
     if not torn:
         return []
     finished = {estimate.track_id for estimate in store.estimates()}

@@ -20,7 +20,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import FolderLock, ReservedSpace
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.store.ledger import END, FILE_KINDS, STATE, Signer, lines_sha256, read_chain
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_BY_ITSELF, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
     CHECKS,
     CLIPS,
@@ -290,6 +290,12 @@ class LengthStore:
         times = [run[name] or 0 for run in runs for name in ("started_ns", "ended_ns")]
         began = [run["started_ns"] for run in runs if run["run_id"] == self.run_id]
         return (max(times) - began[0]) / 1e9 if began else 0.0
+
+    def was_cut_off(self) -> bool:
+        """True if a crash ended the run before this one; rows of `recover` are no runs."""
+        before = [run for run in rows(self._rows.database, RUNS) if run["run_id"] != self.run_id]
+        runs = [run for run in before if not (run["ended_by"] or "").startswith(NOT_BY_ITSELF)]
+        return bool(runs) and runs[-1]["ended_ns"] is None
 
     def resume_after_ns(self) -> int:
         """The capture time after which a live source continues, for any setting of the clock."""

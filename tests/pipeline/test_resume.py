@@ -1,6 +1,7 @@
 """A run continues where earlier ones in its folder ended, and finishes their fish."""
 
-from collections.abc import Callable, Iterator
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.pipeline.run_folder import FROM_RECORDING, recover_folder
 from stream_dmr.pipeline.run_outputs import interrupted_tracks, resume_source
 from stream_dmr.recording.mcap.mcap_sink import McapSink
@@ -64,9 +65,11 @@ def again(store: LengthStore, folder: Path) -> LengthStore:
     return LengthStore(folder, FACTS)
 
 
-def record(folder: Path, *, is_torn: bool) -> None:
-    sink = McapSink(folder / "recording.mcap", header(), flush_s=0.0)
-    for message in MESSAGES:
+def record(
+    folder: Path, name: str = "recording.mcap", *, is_torn: bool, final: Sequence[Message] = FINAL
+) -> None:
+    sink = McapSink(folder / name, header(), flush_s=0.0)
+    for message in [m for m in MESSAGES if m in final or m not in FINAL]:
         sink.write(make_record(message, RecordingSettings()))
     if not is_torn:
         sink.close()
@@ -112,6 +115,21 @@ def test_fish_in_view_at_a_crash_are_finished_by_their_recorded_frames(
     frames = interrupted_tracks(repairs, store, on_notice=refuse_notices)
     recorded = [m for m in MESSAGES if isinstance(m, LocalizedFish) and m.track_id == 1]
     assert [f.frame_index for f in frames] == [m.frame_index for m in recorded]
+
+
+@pytest.mark.parametrize("final", [[], FINAL[1:]], ids=["none left", "one left"])
+def test_fish_in_view_at_a_crash_are_finished_after_recover_too(
+    store: LengthStore, tmp_path: Path, final: list[LengthEstimate]
+):
+    out = Path(shutil.copytree(store.path.parent, tmp_path / "cut-off"))
+    record(out, "recording-000001.mcap", is_torn=True, final=final)
+    assert list(recover_folder(out))
+    tracks = {m.track_id for m in MESSAGES if isinstance(m, LocalizedFish)}
+    with closing(LengthStore(out, FACTS)) as later:
+        frames = interrupted_tracks([], later, on_notice=refuse_notices)
+    assert {f.track_id for f in frames} == tracks - {m.track_id for m in final}
+    with closing(LengthStore(out, FACTS)) as later:  # the run before it ended
+        assert interrupted_tracks([], later, on_notice=refuse_notices) == []
 
 
 def test_without_a_crash_no_track_was_interrupted(store: LengthStore):
