@@ -66,6 +66,8 @@ def _yolov5(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
     (rows,) = outputs
     if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] < 6:
         raise OutputShapeError("(1, boxes, 5 + classes)")
+    if rows.shape[1] < rows.shape[2]:  # as of "yolo", which would give boxes of noise, or none
+        raise OutputShapeError("(1, boxes, 5 + classes) with more boxes than classes")
     return _corners(rows[0, :, :4]), rows[0, :, 4:5] * rows[0, :, 5:]
 
 

@@ -194,6 +194,7 @@ def test_models_that_take_no_picture_are_refused(tmp_path, knobs):
         ([np.ones((1, 6, 9))] * 2, "yolo", "expected 1 outputs, got 2"),
         ([np.ones((1, 6, 9))], "detr", "expected 2 outputs, got 1"),
         ([np.zeros((1, 9, 6))], "yolo", "more boxes than classes, got (1, 9, 6)"),
+        ([np.zeros((1, 6, 9))], "yolov5", "more boxes than classes, got (1, 6, 9)"),
         ([np.zeros((1, 4, 9))], "yolo", "(1, 4 + classes, boxes), got (1, 4, 9)"),
         ([np.zeros((6, 9))], "yolo", "got (6, 9)"),
         ([np.zeros((1, 9, 5))], "yolov5", "(1, boxes, 5 + classes), got"),
