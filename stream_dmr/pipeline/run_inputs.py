@@ -174,9 +174,14 @@ def checked_inputs(request: RunOptions) -> Inputs:
     try:
         if calibration is not None:
             require_size(calibration, width=source.width, height=source.height)
+        is_since_1970 = _is_since_1970(source)
+        if request.start_utc and is_since_1970:
+            raise UserError(
+                f"--start-utc: expected with a video or pictures, got it with {source.name}, whose "
+                "frames have times of their own; leave it out"
+            )
         positions = None
         if request.nmea is not None:
-            is_since_1970 = _is_since_1970(source)
             positions = open_positions(request.nmea, config.sensors, is_since_1970=is_since_1970)
     except UserError:
         reader.close()

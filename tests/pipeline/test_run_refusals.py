@@ -177,6 +177,14 @@ def test_a_detector_that_is_none_is_refused_before_the_first_frame(clip: Path):
         assert_refused(invoke("run", options), expected)
 
 
+def test_the_start_of_what_has_times_of_its_own_is_refused(clip: Path):
+    (clip / "clips").mkdir()
+    (clip / "video.mp4").rename(clip / "clips" / "1.mp4")
+    options = {"--source": str(clip / "clips"), "--out": str(clip / "out")}
+    outcome = invoke("run", options | {"--start-utc": "2026-11-22T06:00:00Z"})
+    assert_refused(outcome, "--start-utc: expected with a video or pictures, got it with clips")
+
+
 def test_a_missing_option_is_refused(clip: Path):
     outcome = invoke("run")
     assert outcome.code == 2
