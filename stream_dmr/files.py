@@ -150,12 +150,12 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)  # a pipe would wait for its writer
 
 
-def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file that people write, such as settings.
+def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of a file that people write, such as settings, without the BOM of some editors.
 
     Raises OSError if it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
     """
-    return read_small(path, max_bytes=max_bytes).decode(encoding)
+    return read_small(path, max_bytes=max_bytes).decode("utf-8-sig")
 
 
 def read_secret(path: Path, *, where: str, what: str = "the access token") -> str:

@@ -105,7 +105,7 @@ def repeated_videos(jobs: Sequence[Job]) -> list[str]:
 
 def _rows(path: Path) -> list[dict[str | None, str | None]]:
     try:
-        text = read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES)
+        text = read_text(path, max_bytes=_MAX_BYTES)
         reader = csv.DictReader(io.StringIO(text, newline=""))
         rows, columns = list(reader), reader.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -512,7 +512,7 @@ def unused_boxes(frames: Mapping[int, Sequence[AnnotatedBox]], last_frame: int) 
 
 def _read_text(path: Path) -> str:
     try:
-        return read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES)
+        return read_text(path, max_bytes=_MAX_BYTES)
     except UnicodeDecodeError:
         raise AnnotationError(
             f"{path}: expected a text file of boxes ({COLUMNS}), got binary data"

@@ -295,9 +295,7 @@ _MAX_BYTES = 100_000_000  # a million pictures; chosen
 
 def _read(path: Path) -> dict[str, int]:
     try:
-        header, *rows = csv.reader(
-            read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES).splitlines()
-        )
+        header, *rows = csv.reader(read_text(path, max_bytes=_MAX_BYTES).splitlines())
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise AnnotationError(
             f"{path}: expected a CSV in UTF-8, got: {reason_of(error)}; save it as CSV UTF-8"

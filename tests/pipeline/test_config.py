@@ -36,6 +36,11 @@ def test_the_committed_file_gives_the_defaults():
     assert load_config(COMMITTED) == Config() == load_config(None)
 
 
+def test_a_file_of_a_windows_editor_is_read(tmp_path: Path):
+    file = write(tmp_path, "\ufeff[crop_fish]\r\ncrop_size_px = 96\r\n")
+    assert load_config(file).crop_fish.crop_size_px == 96
+
+
 def test_every_knob_has_a_comment():
     for table in Config.model_fields:
         for key, field in type(getattr(Config(), table)).model_fields.items():
