@@ -21,7 +21,9 @@ from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.species import SpeciesEvidence, SpeciesSettings, forms_of_species
 from stream_dmr.template.template import Template
 
-_DECIDING_FRAMES = 3  # good frames: each takes a fit of every candidate
+# Good frames: each takes a fit of every candidate. They follow each other, so that their masks are
+# wrong alike, and all of them are worth as much as one: their evidence is averaged.
+_DECIDING_FRAMES = 3
 # Most evidence of one frame against a candidate, nats: its mask may be wrong. Chosen by trial.
 _MAX_AGAINST = 8.0
 _MIN_VISIBLE = 0.9  # of a frame that decides
@@ -32,13 +34,19 @@ class _TrackState:
     """The state from which the next frame of a track starts."""
 
     candidates: Sequence[int]  # the indices of its possible candidates
-    against: Float[np.ndarray, "K"]  # nats against each candidate
+    prior: Float[np.ndarray, "K"]  # nats against each candidate, before any frame
+    nats: Float[np.ndarray, "K"]  # against each by its frames, summed
     log_sizes: Float[np.ndarray, "K"]  # by each of them, summed over the frames that said so
     num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
     best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
     head: HeadTracker = field(default_factory=HeadTracker)
     species: SpeciesEvidence
+
+    @property
+    def against(self) -> Float[np.ndarray, "K"]:
+        """Nats against each candidate by its masks and the candidates' shares."""
+        return self.prior + self.nats / max(self.num_decided, 1)
 
 
 class TrackFitter:
@@ -120,7 +128,8 @@ class TrackFitter:
             choice = self._candidates.choice(crop.timestamp_ns)
         return _TrackState(
             candidates=choice.indices,
-            against=-np.log(choice.shares),
+            prior=-np.log(choice.shares),
+            nats=np.zeros(len(choice.indices)),
             log_sizes=np.zeros(len(choice.indices)),
             species=SpeciesEvidence(self._species),
         )
@@ -170,6 +179,6 @@ class TrackFitter:
             return
         nats = np.array([self.fitters[n].nats(fit) for n, fit in solved.items()])
         if np.isfinite(nats).all():
-            track.against += np.minimum(nats - nats.min(), _MAX_AGAINST)
+            track.nats += np.minimum(nats - nats.min(), _MAX_AGAINST)
             track.log_sizes += [self.fitters[n].log_size(fit) for n, fit in solved.items()]
             track.num_decided += 1

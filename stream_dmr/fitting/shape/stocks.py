@@ -111,10 +111,9 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
     return [items[place] for place in np.unique(places)]
 
 
-# Weight of a fish's evidence for a form, summed over the frames that decided it: they follow each
-# other, so that three are worth little more than one. All fish of a stock are worth no more than
-# three of them: masks of one film are too broad or too slim alike.
-_EVIDENCE_WORTH, _FISH_WORTH = 1 / 3, 3.0
+# All fish of a stock are worth no more evidence for a form than so many: masks of one film are too
+# broad or too slim alike.
+_FISH_WORTH = 3.0
 # Most evidence of one fish for and against separating two groups, nats: a mask may be wrong. Chosen
 # by trial.
 _MAX_FOR, _MAX_AGAINST = 20.0, -6.0
@@ -268,8 +267,7 @@ class _StockLearner:
         each = np.array([self._against[track_id] for track_id in sorted(fish)])
         # Finite, since fish of one stock may each rule out another form.
         against = np.minimum(each, each.min(axis=1, keepdims=True) + _RULED_OUT).mean(axis=0)
-        worth = _EVIDENCE_WORTH * min(float(len(each)), _FISH_WORTH)
-        nats = worth * against - np.log(self._forms.shares)
+        nats = min(float(len(each)), _FISH_WORTH) * against - np.log(self._forms.shares)
         shares = np.exp(nats.min() - nats)
         return FormOdds(self._forms.coefficients, shares / shares.sum())
 
