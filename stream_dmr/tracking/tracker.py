@@ -11,7 +11,9 @@ from its track in the tracker, and stays inside of segmentation. `TrackNumbering
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import cv2
 import numpy as np
 from pydantic import Field
 from scipy.optimize import linear_sum_assignment
@@ -31,6 +33,9 @@ _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; ab
 _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
 _MIN_PAUSE_NS = 2_000_000_000  # chosen: by then another fish may hang in a fish's place
+# An exposure that changes at once changes all colours: the light in which they are compared follows
+# within some thirty frames. Chosen.
+_LIGHT_RATE, _LEAST_CHANGE, _LIGHT_STEP_PX = 0.04, 0.04, 16
 _MIN_FRAMES_BESIDE = 3  # in which a newcomer and a fish were seen at once: they are two
 
 
@@ -62,6 +67,7 @@ class Tracker:
         self._tracks: list[Track] = []
         self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
         self._num_started = 0
+        self._light = 0.0  # median grey level + 1 of late; 0: unknown
         self._last_ns = 0  # capture time of the last frame
         self._step_ns = 0  # from the frame before to it; 0 before the first
 
@@ -81,6 +87,7 @@ class Tracker:
 
     def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
         """The tracks seen in a frame. Frames must come in order; some may be missing."""
+        frame = self._in_steady_light(frame)
         observations = [
             Observation(frame.image, candidate)
             for candidate in candidates
@@ -104,6 +111,15 @@ class Tracker:
         return [
             t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
         ]
+
+    def _in_steady_light(self, frame: Frame) -> Frame:
+        """The frame in the light of those before it."""
+        light = 1.0 + float(np.median(frame.image[::_LIGHT_STEP_PX, ::_LIGHT_STEP_PX, 1]))
+        self._light += _LIGHT_RATE * (light - self._light) if self._light else light
+        gain = self._light / light
+        if abs(gain - 1) < _LEAST_CHANGE:
+            return frame
+        return replace(frame, image=cv2.convertScaleAbs(frame.image, alpha=gain))
 
     def _is_after_pause(self, timestamp_ns: int) -> bool:
         """True after a gap in time, as of a camera that films what moves, but not in time-lapse."""

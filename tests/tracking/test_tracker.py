@@ -179,6 +179,21 @@ def test_after_a_gap_in_time_hangs_another_fish(times_s: list[float], expected: 
     assert [one.track_number for some in found for one in some] == expected
 
 
+@pytest.mark.parametrize("gain", [0.7, 1.3])
+def test_a_fish_keeps_its_id_when_the_exposure_changes_at_once(gain: float):
+    tracker, found = Tracker(TrackerSettings()), list[int]()
+    texture = np.random.default_rng(0).normal(
+        -60, 20, (480, 640, 1)
+    )  # within a fish, not the water
+    for i in range(1, 21):
+        frame = spots_frame([climbing(i)], i)
+        image = np.where(frame.image > 100, frame.image + texture, frame.image)
+        lit = cv2.convertScaleAbs(image, alpha=gain if i > 9 else 1.0)
+        tracked = tracker.step(replace(frame, image=lit), spots_candidates([climbing(i)]))
+        found += [one.track_number for one in tracked]
+    assert found == [1] * 20
+
+
 def test_a_track_has_the_evidence_of_all_its_frames():
     def placed(i: int) -> Candidate:
         x = 200.0 + 4.0 * i
