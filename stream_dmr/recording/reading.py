@@ -61,7 +61,8 @@ class Recording(Protocol):
 def open_recordings(paths: Sequence[Path]) -> Recording:
     """One recording of all paths: files, and folders of a run or of its segments.
 
-    Raises RecordingError if one can't be read, or if they are not of the same run.
+    Segments of one folder are read in the order of their names, however they are given. Raises
+    RecordingError if one can't be read or is given twice, or if they are not of the same run.
     """
     files = [file for path in paths for file in files_of(path)]
     if not files:
@@ -69,6 +70,7 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
     for file in files:
         if file.exists() and not file.is_file():
             raise RecordingError(f"{file}: expected a recording, got a pipe or a device")
+    files = _in_order(files)
     segments = [RrdRecording(f) if f.suffix == ".rrd" else McapRecording(f) for f in files]
     return segments[0] if len(segments) == 1 else _Segments(files, segments)
 
@@ -105,6 +107,23 @@ def files_of(path: Path) -> list[Path]:
     if found := [*whole, *parts] or list(path.glob("*.rrd")):
         return sorted(found, key=natural_order)
     raise RecordingError(f"{path}: expected a folder with a recording, found no .mcap and no .rrd")
+
+
+def _in_order(files: Sequence[Path]) -> Sequence[Path]:
+    """The files of one folder in natural order, others as given.
+
+    Raises RecordingError if one comes twice, or beside its view: its frames would count twice.
+    """
+    once = dict[tuple[Path, str], Path]()
+    for file in files:
+        key = file.parent.resolve(), Path(file.name.removesuffix(PART)).stem
+        if key in once:
+            raise RecordingError(
+                f"{file}: expected each recording once, got it as {once[key]} too; leave out one"
+            )
+        once[key] = file
+    is_one_folder = len({folder for folder, _ in once}) == 1
+    return sorted(files, key=natural_order) if is_one_folder else files
 
 
 class _Segments:
@@ -164,11 +183,14 @@ def require_time(recording: Recording, selection: Selection) -> None:
     selected = Selection(time_ns=selection.time_ns)
     if next(messages_of(recording, Frame, selected), None) is None:
         times = [frame.timestamp_ns for frame in messages_of(recording, Frame)]
-        first, last = (ns / 1e9 for ns in selection.time_ns)
-        spans = f", from {min(times) / 1e9:g} to {max(times) / 1e9:g} s" if times else ""
-        raise UserError(
-            f"--time {first:g}:{last:g}: expected a time of the recording{spans}, got none"
-        )
+        first, last = map(_seconds, selection.time_ns)
+        spans = f", from {_seconds(min(times))} to {_seconds(max(times))} s" if times else ""
+        raise UserError(f"--time {first}:{last}: expected a time of the recording{spans}, got none")
+
+
+def _seconds(time_ns: int) -> str:
+    """A capture time to the millisecond; those of cameras are seconds since 1970."""
+    return f"{round(time_ns / 1e9, 3):.15g}"
 
 
 def require_tracks(selection: Selection, known: Collection[int]) -> None:

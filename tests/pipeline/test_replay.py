@@ -216,6 +216,20 @@ def test_segments_are_read_as_one(run, tmp_path):
     assert contents(tmp_path) == 2 * contents(folder / "recording.mcap")
 
 
+def test_segments_are_read_in_order_however_they_are_given(tmp_path):
+    for name in ("seg-2.mcap", "seg-10.mcap"):
+        (tmp_path / name).write_bytes(b"no recording")
+    with pytest.raises(RecordingError, match=r"seg-2\.mcap"):  # the first that is opened
+        open_recordings([tmp_path / "seg-10.mcap", tmp_path / "seg-2.mcap"])
+
+
+@pytest.mark.parametrize("again", ["recording.rrd", "recording.mcap", "."])
+def test_no_frame_is_read_twice(run, again):
+    folder, _ = run
+    with pytest.raises(RecordingError, match="expected each recording once"):
+        open_recordings([folder / "recording.mcap", folder / again])
+
+
 class TestDamage:
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_is_found(self, run, tmp_path_factory, seed):

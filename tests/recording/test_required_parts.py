@@ -4,9 +4,12 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stream_dmr.errors import UserError
+from stream_dmr.messages import Frame
+from stream_dmr.recording.codec import encode
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import (
     open_recordings,
@@ -62,6 +65,19 @@ def test_what_is_not_in_an_rrd_is_refused_alike(folder: Path):
         require_selected(recording, Selection(tracks=frozenset({2, 77})))
     with pytest.raises(UserError, match=r"from 0 to 0\.5 s"):
         require_selected(recording, Selection.from_seconds((100.0, 200.0)))
+
+
+def test_times_of_a_camera_are_told_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """They are seconds since 1970."""
+    times = (1_795_218_597_333_333_333, 1_795_219_799_900_000_000)
+    recording, black = open_recordings([folder]), np.zeros((2, 2, 3), np.uint8)
+    payloads = [
+        (Frame, encode(Frame(frame_index=1, timestamp_ns=time_ns, image=black, source="")))
+        for time_ns in times
+    ]
+    monkeypatch.setattr(recording, "payloads", lambda *_, **__: iter(payloads))
+    with pytest.raises(UserError, match=r"from 1795218597\.333 to 1795219799\.9 s"):
+        require_selected(recording, Selection.from_seconds((0.0, 3.0)))
 
 
 def test_a_frame_that_is_not_in_it_is_refused(folder: Path, tmp_path: Path):
