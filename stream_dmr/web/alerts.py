@@ -3,6 +3,7 @@
 import json
 import re
 import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -59,7 +60,8 @@ class AlertSender:
         self._deliver = _deliveries(settings)
         # The kinds of problems in the last alert that each address took.
         self._told = dict[Callable[[Alert], None], list[str]]((d, []) for d in self._deliver)
-        self._failing = set[Callable[[Alert], None]]()
+        # Of addresses that failed: when each is tried again, and the pause after that, s.
+        self._paused = dict[Callable[[Alert], None], tuple[float, float]]()
         self._run, self._problems, self._on_notice = run, problems, on_notice
         self._look_s, self._first_pause_s = look_s, first_pause_s
         self._ended = threading.Event()
@@ -77,13 +79,13 @@ class AlertSender:
             problems = list(self._problems())
             kinds = _kinds(problems)
             num_equal, seen = (num_equal + 1 if kinds == seen else 1), kinds
-            if num_equal >= _SETTLE_LOOKS and any(self._told[d] != kinds for d in self._deliver):
-                self._send(problems)
+            if num_equal >= _SETTLE_LOOKS:
+                self._send(problems, kinds)
 
-    def _send(self, problems: Sequence[str]) -> None:
-        """Send an alert to the addresses that know another state.
+    def _send(self, problems: Sequence[str], kinds: list[str]) -> None:
+        """Send an alert to the addresses that know another state, unless they failed just now.
 
-        Ends before if the health changes or the run ends.
+        Each has a pause of its own: one that is gone for good keeps no news from the others.
         """
         alert = Alert(
             run=self._run,
@@ -91,27 +93,25 @@ class AlertSender:
             problems=problems,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
         )
-        kinds, pause_s = _kinds(problems), self._first_pause_s
-        while True:
-            for deliver in self._deliver:
-                if self._told[deliver] != kinds and self._try(deliver, alert):
-                    self._told[deliver] = kinds
-            if all(told == kinds for told in self._told.values()) or self._ended.wait(pause_s):
-                return
-            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-            if _kinds(self._problems()) != kinds:
-                return
+        for deliver in self._deliver:
+            due_s, pause_s = self._paused.get(deliver, (0.0, self._first_pause_s))
+            if self._told[deliver] == kinds or time.monotonic() < due_s or self._ended.is_set():
+                continue
+            if self._try(deliver, alert):
+                self._told[deliver] = kinds
+                self._paused.pop(deliver, None)
+            else:
+                longer_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+                self._paused[deliver] = time.monotonic() + pause_s, longer_s
 
     def _try(self, deliver: Callable[[Alert], None], alert: Alert) -> bool:
         try:
             deliver(alert)
         except (OSError, ValueError, HTTPException) as error:  # the last: an answer that is no HTTP
-            if deliver not in self._failing:
+            if deliver not in self._paused:
                 line = f"[alerts] could not be sent, tried again later: {reason_of(error)}"
                 self._on_notice(line)
-            self._failing.add(deliver)
             return False
-        self._failing.discard(deliver)
         return True
 
 

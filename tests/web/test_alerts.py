@@ -71,14 +71,20 @@ def serving(webhook: Webhook) -> Generator[Webhook]:
 
 
 @contextmanager
-def watching(settings: AlertSettings, problems: list[str], notices: list[str]) -> Generator[None]:
+def watching(
+    settings: AlertSettings,
+    problems: list[str],
+    notices: list[str],
+    *,
+    first_pause_s: float = 0.01,
+) -> Generator[None]:
     sender = AlertSender(
         settings,
         run="haul",
         problems=lambda: list(problems),
         on_notice=notices.append,
         look_s=0.01,
-        first_pause_s=0.01,
+        first_pause_s=first_pause_s,
     )
     try:
         yield
@@ -176,6 +182,22 @@ def test_a_service_that_fails_is_noted_once_and_without_its_password(
     assert notice.startswith("[alerts] could not be sent, tried again later: ")
     assert "services.txt, line 2 failed; why: apprise -vv" in notice
     assert "secret" not in notice + "".join(capfd.readouterr())
+
+
+def test_an_address_that_fails_keeps_no_news_from_another(
+    apprise_file: Callable[..., AlertSettings],
+):
+    """However long it waits for its own next try."""
+    problems, notices = ["the measurement hangs"], list[str]()
+    with serving(Webhook()) as one, serving(Webhook(num_refused=10**9)) as other:
+        settings = apprise_file(service_of(one), service_of(other))
+        with watching(settings, problems, notices, first_pause_s=3600.0):
+            assert one.received.get(timeout=WAIT_S)["type"] == "failure"
+            while not notices:
+                threading.Event().wait(0.01)
+            problems.clear()
+            assert one.received.get(timeout=WAIT_S)["type"] == "success"
+    assert len(notices) == 1
 
 
 def service_of(server: Webhook) -> str:
