@@ -218,7 +218,18 @@ def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
     for verdict in standing(verdicts):
         if verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews):
             continue
-        reviews[verdict.track_id] = reviews.get(verdict.track_id, NOT_REVIEWED).after(verdict)
+        before = reviews.get(verdict.track_id, NOT_REVIEWED)
+        reviews[verdict.track_id] = before.after(verdict)
+        other = verdict.other_fish
+        if verdict.kind == "merge" and other is not None and before.species:
+            remaining = reviews.get(other, NOT_REVIEWED)
+            if not remaining.species:  # one fish has one species; its fate is that of its end
+                reviews[other] = replace(
+                    remaining,
+                    species=before.species,
+                    reviewer=verdict.reviewer,
+                    written_ns=verdict.written_ns,
+                )
     return reviews
 
 

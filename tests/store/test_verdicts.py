@@ -181,3 +181,15 @@ def test_an_edit_of_fish_that_another_reviewer_has_changed_is_refused(database: 
 def test_without_a_database_there_is_one_line(tmp_path: Path):
     with pytest.raises(OutputError, match="expected a database of lengths, found none"):
         read_verdicts(tmp_path / "lengths.db")
+
+
+def test_a_species_that_was_named_goes_on_with_a_merged_fish():
+    named = replace(ACCEPT, kind="species", species="COD")
+    merged = Verdict(track_id=1, kind="merge", other_fish=2, reviewer="Bob", written_ns=7)
+    after = reviews_of([named, merged])
+    assert (after[2].species, after[2].decision, after[2].reviewer) == ("COD", "", "Bob")
+    own = replace(named, track_id=2, species="HAD")
+    assert reviews_of([own, named, merged])[2].species == "HAD"
+    assert reviews_of([named, merged, own])[2].species == "HAD"
+    undone = Verdict(track_id=1, kind="undo", undoes=2, reviewer="Bob")
+    assert 2 not in reviews_of([named, merged, undone])
