@@ -106,7 +106,7 @@ def _write(
 
 _VALIDATION_BANK_DIVISOR = 10  # of the training bank's size: the validation bank's
 
-TRAINING_FILES = ("unet.pt", "last.pt", "scores.json", "curve.png", "worst.png")
+TRAINING_FILES = ("unet.onnx", "unet.pt", "last.pt", "scores.json", "curve.png", "worst.png")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -147,6 +147,12 @@ class UNetTrainer:
         if not path.exists():
             raise ModelError(f"{path}: expected the checkpoint of an earlier run, found none")
         state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
+        if state["settings"] == self._identity() | {"tuned": not self.is_fine_tuning}:
+            had, got = ("none", "one") if self.is_fine_tuning else ("one", "none")
+            raise ModelError(
+                f"{path}: expected --init or --images if that training had one of them; it had "
+                f"{had}, got {got}; give the options of that training, or another --out"
+            )
         if state["settings"] != self._identity():
             raise ModelError(
                 f"{path}: expected a checkpoint of the same settings, got one of others; give the "

@@ -98,6 +98,8 @@ def test_impossible_requests_are_refused_before_training(trained, tmp_path):
     other = TINY.model_copy(update={"learning_rate": 1e-3})
     with pytest.raises(ModelError, match="of the same settings"):
         train_unet(request(out, settings=other, resume=True), stop=never())
+    with pytest.raises(ModelError, match="it had none, got one; give the options"):
+        train_unet(request(out, resume=True, init=SHIPPED), stop=never())
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="expected a place to write to"):
         train_unet(request(tmp_path / "file"), stop=never())
@@ -117,6 +119,15 @@ def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, arguments):
     result = CliRunner().invoke(app, ["train", "--out", "out", *arguments])
     assert result.exit_code != 0
     assert "expected" in str(result.exception)
+
+
+def test_weights_of_one_s_own_are_not_written_over(tmp_path):
+    own = tmp_path / "unet.onnx"
+    own.write_bytes(b"weights of another program")
+    result = CliRunner().invoke(app, ["train", "--out", str(tmp_path)])
+    assert "--overwrite" in str(result.exception)
+    assert own.read_bytes() == b"weights of another program"
+    assert [*tmp_path.iterdir()] == [own]
 
 
 def test_own_fish_are_trained_on_before_own_backgrounds(vessel):
