@@ -1,6 +1,7 @@
 """What a recording has nothing of is refused, by every command in the same words."""
 
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -69,13 +70,15 @@ def test_what_is_not_in_an_rrd_is_refused_alike(folder: Path):
 
 def test_times_of_a_camera_are_told_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
     """They are seconds since 1970."""
-    times = (1_795_218_597_333_333_333, 1_795_219_799_900_000_000)
     recording, black = open_recordings([folder]), np.zeros((2, 2, 3), np.uint8)
-    payloads = [
-        (Frame, encode(Frame(frame_index=1, timestamp_ns=time_ns, image=black, source="")))
-        for time_ns in times
-    ]
-    monkeypatch.setattr(recording, "payloads", lambda *_, **__: iter(payloads))
+
+    def payloads(_: object, selection: Selection = EVERYTHING) -> Iterator[tuple[type, bytes]]:
+        for time_ns in (1_795_218_597_333_333_333, 1_795_219_799_900_000_000):
+            if selection.includes_time(time_ns):
+                frame = Frame(frame_index=1, timestamp_ns=time_ns, image=black, source="")
+                yield Frame, encode(frame)
+
+    monkeypatch.setattr(recording, "payloads", payloads)
     with pytest.raises(UserError, match=r"from 1795218597\.333 to 1795219799\.9 s"):
         require_selected(recording, Selection.from_seconds((0.0, 3.0)))
 
