@@ -34,8 +34,9 @@ _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
 _MIN_PAUSE_NS = 2_000_000_000  # chosen: by then another fish may hang in a fish's place
 # An exposure that changes at once changes all colours: the light in which they are compared follows
-# within some thirty frames. Chosen.
-_LIGHT_RATE, _LEAST_CHANGE, _LIGHT_STEP_PX = 0.04, 0.04, 16
+# within some thirty frames. A few grey levels of dark water are noise, and say nothing of fish in a
+# lamp's light. Chosen.
+_LIGHT_RATE, _LEAST_CHANGE, _LEAST_LEVELS, _LIGHT_STEP_PX = 0.04, 0.04, 4, 16
 _MIN_FRAMES_BESIDE = 3  # in which a newcomer and a fish were seen at once: they are two
 
 
@@ -69,7 +70,7 @@ class Tracker:
         self._num_started = 0
         self._light = 0.0  # median grey level + 1 of late; 0: unknown
         self._last_ns = 0  # capture time of the last frame
-        self._step_ns = 0  # from the frame before to it; 0 before the first
+        self._step_ns = 0  # from the frame before to it, or from 0 to the first
 
     @property
     def is_following(self) -> bool:
@@ -117,7 +118,7 @@ class Tracker:
         light = 1.0 + float(np.median(frame.image[::_LIGHT_STEP_PX, ::_LIGHT_STEP_PX, 1]))
         self._light += _LIGHT_RATE * (light - self._light) if self._light else light
         gain = self._light / light
-        if abs(gain - 1) < _LEAST_CHANGE:
+        if abs(gain - 1) < _LEAST_CHANGE or abs(self._light - light) < _LEAST_LEVELS:
             return frame
         return replace(frame, image=cv2.convertScaleAbs(frame.image, alpha=gain))
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.detection.detector import Candidate
+from stream_dmr.messages import Frame
 from stream_dmr.tracking.track import TrackedCandidate
 from stream_dmr.tracking.tracker import Tracker, TrackerSettings
 from tests.support.frames import ellipse_mask, frame_of
@@ -179,17 +180,30 @@ def test_after_a_gap_in_time_hangs_another_fish(times_s: list[float], expected: 
     assert [one.track_number for some in found for one in some] == expected
 
 
+def lit_fish(frame: Frame, *, water: float, gain: float = 1.0) -> Frame:
+    """A frame of spots with a texture on the fish, over water of a grey level."""
+    texture = np.random.default_rng(0).normal(-60, 20, (480, 640, 1))
+    image = np.where(frame.image > 100, frame.image + texture, water)
+    return replace(frame, image=cv2.convertScaleAbs(image, alpha=gain))
+
+
 @pytest.mark.parametrize("gain", [0.7, 1.3])
 def test_a_fish_keeps_its_id_when_the_exposure_changes_at_once(gain: float):
     tracker, found = Tracker(TrackerSettings()), list[int]()
-    texture = np.random.default_rng(0).normal(
-        -60, 20, (480, 640, 1)
-    )  # within a fish, not the water
     for i in range(1, 21):
         frame = spots_frame([climbing(i)], i)
-        image = np.where(frame.image > 100, frame.image + texture, frame.image)
-        lit = cv2.convertScaleAbs(image, alpha=gain if i > 9 else 1.0)
-        tracked = tracker.step(replace(frame, image=lit), spots_candidates([climbing(i)]))
+        frame = lit_fish(frame, water=60.0, gain=gain if i > 9 else 1.0)
+        tracked = tracker.step(frame, spots_candidates([climbing(i)]))
+        found += [one.track_number for one in tracked]
+    assert found == [1] * 20
+
+
+@pytest.mark.parametrize("levels", [(0, 2), (2, 3), (8, 10)])
+def test_a_fish_in_a_lamp_keeps_its_id_before_dark_water_that_flickers(levels: tuple[int, int]):
+    tracker, found = Tracker(TrackerSettings()), list[int]()
+    for i in range(1, 21):
+        frame = lit_fish(spots_frame([climbing(i)], i), water=levels[i % 3 == 0])
+        tracked = tracker.step(frame, spots_candidates([climbing(i)]))
         found += [one.track_number for one in tracked]
     assert found == [1] * 20
 
