@@ -12,7 +12,6 @@ from functools import partial
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from stream_dmr.errors import ConfigError, reason_of, requires_extra
 from stream_dmr.files import read_secret
@@ -127,7 +126,7 @@ def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
             raise ConfigError(
                 f"[alerts] webhook: expected http://... or https://..., got {settings.webhook!r}"
             )
-        if "@" in urlsplit(settings.webhook).netloc:  # urllib takes it for a part of the host
+        if re.match("https?://[^/?#]*@", settings.webhook):  # urllib takes it for the host's name
             raise ConfigError(
                 "[alerts] webhook: expected an address without user:password@, since recordings "
                 "hold the settings, got one with it; put json://user:password@HOST/PATH, for https "

@@ -309,9 +309,8 @@ def test_settings_that_do_not_fit_are_refused(apprise_file: Callable[..., AlertS
     ):
         assert expected in refusal(apprise_file(*lines))
     assert "expected http://" in refusal(AlertSettings(webhook="ftp://example.org"))
-    said = refusal(AlertSettings(webhook="https://box:secret@example.org/hook"))
-    assert "without user:password@" in said
-    assert "secret" not in said
+    for webhook in ("https://box:secret@example.org/hook", "http://secret@[::1/"):
+        assert "without user:password@" in refusal(AlertSettings(webhook=webhook))
     assert "expected a file with" in refusal(AlertSettings(apprise_file="missing.txt"))
 
 
@@ -320,6 +319,12 @@ def refusal(settings: AlertSettings) -> str:
         pass
     assert "secret" not in str(refused.value)
     return str(refused.value)
+
+
+def test_an_address_that_is_none_or_has_an_at_elsewhere_stops_no_run():
+    for webhook in ("http://[", "https://[::1/hook?by=me@example.org"):
+        with watching(AlertSettings(webhook=webhook), [], []):
+            pass
 
 
 class _Rude(_Handler):
