@@ -131,8 +131,10 @@ class TrackLength:
         std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
         if std_mm > self._settings.max_std_ratio * length_mm:
             return None, None, None
-        # What seems turned just less than a refused frame is as wrong.
-        is_turned = self._refused[Reason.TURNED_AWAY] >= num_used
+        # What seems turned just less than a refused frame is as wrong. Good frames beyond the most
+        # that are used speak for a fish that stays long in sight.
+        num_good = num_used + self._refused[Reason.LONG_ENOUGH]
+        is_turned = self._refused[Reason.TURNED_AWAY] >= num_good
         if is_final and (is_turned or self._has_drifted(self._filter.frames)):
             return None, None, None
         share = self._settings.upward_share

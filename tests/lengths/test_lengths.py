@@ -385,3 +385,10 @@ def test_a_fish_of_which_as_many_frames_are_turned_away_as_count_gets_no_length(
     assert running[-1].length_mm is not None
     assert (final.length_mm is not None) == is_measured
     assert is_measured or final.status == Reason.TOO_UNCERTAIN
+
+
+def test_good_frames_beyond_the_most_that_are_used_outweigh_those_turned_away():
+    frames = [frame(i, 700.0) for i in range(1, 11)]
+    frames += [frame(i, 800.0, reason=Reason.TURNED_AWAY) for i in range(11, 16)]
+    final = run(frames, max_frames=5)[-1]
+    assert (final.frames_used, final.length_mm) == (5, pytest.approx(700.0))
