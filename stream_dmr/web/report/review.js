@@ -65,7 +65,7 @@ async function send(verdict) {
     return say(`Nothing was saved, so nothing is taken back.${DATA.review.undo && ` Once more takes back: ${DATA.review.undo}.`}`);
   }
   const decides = DECISIONS.includes(verdict.kind);
-  if (decides && deciding === fish.id && !verdict.sure) return say("Saving ...");  // not a second time
+  if (decides && deciding === fish.id) return say("Saving ...");  // not a second time
   if (decides) deciding = fish.id;
   const seenBefore = new Set(DATA.seen);  // `refresh` may bring a new fish before the answer does
   let answered;
@@ -73,12 +73,12 @@ async function send(verdict) {
     const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ run: fish?.run ?? 0, track_id: fish?.track_id ?? 0, ...verdict }) });
     if (!answer.ok && answer.status !== 409) return refuse((await answer.text()).trim());
     answered = await answer.json();
-    if (answered.question) return confirm(answered.question) ? send({ ...verdict, sure: true }) : refuse("Not saved.");
   } catch {
     return refuse("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
   } finally {
-    if (decides) deciding = null;
+    if (decides && deciding === fish.id) deciding = null;
   }
+  if (answered.question) return confirm(answered.question) ? send({ ...verdict, sure: true }) : refuse("Not saved.");
   const { rows, said } = answered;
   isRefused = false;
   DATA.review.undo = answered.undo;
