@@ -166,9 +166,9 @@ class Reason(StrEnum):
     TOO_UNCERTAIN = (
         "too uncertain",
         _FISH,
-        "its frames contradict each other, it gets ever longer or shorter, as many frames are "
-        "`turned away` as count, or none of them is certain: the std is above `[smooth_length] "
-        "max_std_ratio`",
+        "its frames contradict each other, or none of them is certain: the std is above "
+        "`[smooth_length] max_std_ratio`; or it gets ever longer or shorter, or as many frames are "
+        "`turned away` as count",
         "look at its frames",
     )
     LONGER_THAN_SPECIES = (
