@@ -41,6 +41,18 @@ def test_a_fish_is_given_the_shape_that_it_has(log_factor, candidate):
     assert shapes[-1].shape_std_ratio > 0
 
 
+def test_masks_that_are_wrong_alike_are_no_more_evidence_than_one():
+    shapes = candidates(fore=tapered(-0.1), aft=tapered(0.1))
+    fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=shapes)
+    (sample,) = fish_of(tapered(0.1), track_id=4, num_frames=1).samples
+    margins = []
+    for _ in range(3):
+        fitter.fit(sample.crop)
+        margins.append(np.ptp(fitter.against(4)))
+    assert margins[0] > 1
+    assert margins == pytest.approx([margins[0]] * 3, rel=0.2)
+
+
 def test_the_paper_s_loss_tells_shapes_apart_as_well():
     shapes = candidates(fore=tapered(-0.3), aft=tapered(0.3))
     settings = SETTINGS.model_copy(update={"prior_weight": 0.0})
