@@ -82,7 +82,9 @@ class FitMeshSettings(Settings):
         default=100, ge=1, description="smallest mask that is fitted, crop pixels"
     )
     edge_std_px: float = Field(
-        default=1.0, ge=0.01, description="std of a mask's edge, crop pixels; enters the uncertainty"
+        default=1.0,
+        ge=0.01,
+        description="std of a mask's edge, crop pixels; enters the uncertainty",
     )
     edge_correlation_px: float = Field(
         default=8.0,
