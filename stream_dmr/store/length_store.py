@@ -292,9 +292,13 @@ class LengthStore:
         return (max(times) - began[0]) / 1e9 if began else 0.0
 
     def was_cut_off(self) -> bool:
-        """True if a crash ended the run before this one; rows of `recover` are no runs."""
+        """True if a crash ended the run before this one.
+
+        Rows of `recover` are no runs, nor is what ended without a frame: a start that was refused.
+        """
         before = [run for run in rows(self._rows.database, RUNS) if run["run_id"] != self.run_id]
         runs = [run for run in before if not (run["ended_by"] or "").startswith(NOT_BY_ITSELF)]
+        runs = [run for run in runs if run["ended_ns"] is None or run["frames_done"]]
         return bool(runs) and runs[-1]["ended_ns"] is None
 
     def resume_after_ns(self) -> int:

@@ -125,9 +125,14 @@ def test_fish_in_view_at_a_crash_are_finished_after_recover_too(
     record(out, "recording-000001.mcap", is_torn=True, final=final)
     assert list(recover_folder(out))
     tracks = {m.track_id for m in MESSAGES if isinstance(m, LocalizedFish)}
-    with closing(LengthStore(out, FACTS)) as later:
-        frames = interrupted_tracks([], later, on_notice=refuse_notices)
-    assert {f.track_id for f in frames} == tracks - {m.track_id for m in final}
+    for is_refused in (True, False):  # the next start, before it has a frame
+        with closing(LengthStore(out, FACTS)) as later:
+            frames = interrupted_tracks([], later, on_notice=refuse_notices)
+            later.count_frames(None)
+            if not is_refused:
+                later.frame_done()
+            later.end("a test")
+        assert {f.track_id for f in frames} == tracks - {m.track_id for m in final}
     with closing(LengthStore(out, FACTS)) as later:  # the run before it ended
         assert interrupted_tracks([], later, on_notice=refuse_notices) == []
 
