@@ -54,12 +54,11 @@ def batch(
     Writes --out/videos/NAME (as `run` does), videos.csv (what became of each) and dataset (Parquet:
     a row per fish, a row per fish and frame). A video that can't be measured fails alone.
     """
-    of_other = (
-        {"--address": address, "--gpus": gpus} if engine == "local" else {"--workers": workers}
-    )
+    other, of_other = "local", {"--workers": workers}
+    if engine == "local":
+        other, of_other = "ray", {"--address": address, "--gpus": gpus}
     for option, value in of_other.items():
         if value:
-            other = "ray" if engine == "local" else "local"
             raise UserError(
                 f"{option}: expected with --engine {other} alone, got {value} with {engine}; "
                 "leave it out"

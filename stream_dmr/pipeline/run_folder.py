@@ -21,7 +21,7 @@ from stream_dmr.store.fish import last_run_like
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
-from stream_dmr.store.run_facts import NOT_BY_ITSELF, run_facts
+from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import write_lengths
 from stream_dmr.store.schema import NAME, open_for_reading, read_estimates
 
@@ -166,7 +166,7 @@ def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
         names = ("vessel", "trip", "haul", "utc_zero_ns")  # which no recording has
         facts = replace(facts, **{name: getattr(known, name) for name in names})
     with closing(LengthStore(folder, facts, signer=signer)) as store:
-        store.end(f"{NOT_BY_ITSELF}: its lengths are {FROM_RECORDING}")
+        store.end(f"not by itself: its lengths are {FROM_RECORDING}")
         for estimate in missing:
             store.add(estimate, flags=[FROM_RECORDING])
             yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"

@@ -38,7 +38,7 @@ class VideoFile(Source):
         self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
-        self._is_avi = start[:4] == b"RIFF"
+        self._may_have_gaps = start.startswith((_MATROSKA, b"RIFF"))  # or AVI
         self._decoder = open_decoder(path)
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
@@ -128,8 +128,7 @@ class VideoFile(Source):
         """
         if self._is_closed or not self.num_frames:
             return
-        has_gaps = self._is_matroska or self._is_avi
-        if has_gaps and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
+        if self._may_have_gaps and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
             self.num_frames = num_read
         if num_read < self.num_frames - 1:
             self.is_cut_off = True

@@ -20,7 +20,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import FolderLock, ReservedSpace
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.store.ledger import END, FILE_KINDS, STATE, Signer, lines_sha256, read_chain
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_BY_ITSELF, NOT_ENDED, RunFacts
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
     CHECKS,
     CLIPS,
@@ -294,11 +294,11 @@ class LengthStore:
     def was_cut_off(self) -> bool:
         """True if a crash ended the run before this one.
 
-        Rows of `recover` are no runs, nor is what ended without a frame: a start that was refused.
+        What ended without a frame is no run: a start that was refused, or lengths that `recover`
+        took over.
         """
         before = [run for run in rows(self._rows.database, RUNS) if run["run_id"] != self.run_id]
-        runs = [run for run in before if not (run["ended_by"] or "").startswith(NOT_BY_ITSELF)]
-        runs = [run for run in runs if run["ended_ns"] is None or run["frames_done"]]
+        runs = [run for run in before if run["ended_ns"] is None or run["frames_done"]]
         return bool(runs) and runs[-1]["ended_ns"] is None
 
     def resume_after_ns(self) -> int:

@@ -13,7 +13,6 @@ SOURCE_CUT_OFF = "the source, which is damaged or cut off there"
 STOPPED = "a stop before the end of the source"
 ENDLESS_STOPPED = "a stop; the source has no end"
 NOT_ENDED = "nothing so far: it goes on, or a crash ended it"
-NOT_BY_ITSELF = "not by itself"  # with a reason: no run, but lengths that `recover` took over
 # The columns of `runs` that a run writes at its end.
 END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
 

@@ -224,12 +224,8 @@ def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
         if verdict.kind == "merge" and other is not None and before.species:
             remaining = reviews.get(other, NOT_REVIEWED)
             if not remaining.species:  # one fish has one species; its fate is that of its end
-                reviews[other] = replace(
-                    remaining,
-                    species=before.species,
-                    reviewer=verdict.reviewer,
-                    written_ns=verdict.written_ns,
-                )
+                named = replace(verdict, kind="species", species=before.species)
+                reviews[other] = remaining.after(named)
     return reviews
 
 

@@ -88,7 +88,8 @@ class Tracker:
 
     def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
         """The tracks seen in a frame. Frames must come in order; some may be missing."""
-        frame = self._in_steady_light(frame)
+        if self._settings.across_frames:
+            frame = self._in_steady_light(frame)
         observations = [
             Observation(frame.image, candidate)
             for candidate in candidates

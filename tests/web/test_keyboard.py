@@ -22,6 +22,7 @@ const key = (name) => document.activeElement.dispatchEvent(
   new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
 const message = () => document.getElementById("message") ?? { textContent: "" };
 """
+FIRST_OPEN = WAIT + "choose(1); await until(() => player.clip?.isDone && player.fish.id === 1);\n"
 
 
 @pytest.fixture
@@ -46,10 +47,8 @@ def kinds(out: Path) -> list[tuple[int, str]]:
 
 def test_four_fish_of_two_runs_by_the_keyboard(tab: Tab, out: Path):
     state = tab.run(
-        WAIT
+        FIRST_OPEN
         + """
-        choose(1);
-        await until(() => player.clip?.isDone && player.fish.id === 1);
         const frames = player.clip.frames.map((one) => [one.frame, one.image !== null]);
         key("a");
         await until(() => state.chosen === 2 && document.getElementById("species-name"));
@@ -95,10 +94,8 @@ def test_four_fish_of_two_runs_by_the_keyboard(tab: Tab, out: Path):
 
 def test_a_missed_fish_is_drawn_measured_and_split(tab: Tab, out: Path):
     tab.run(
-        WAIT
+        FIRST_OPEN
         + """
-        choose(1);
-        await until(() => player.clip?.isDone && player.fish.id === 1);
         key("b");
         showFrame(0);
         CLIP_CANVAS.scrollIntoView({ block: "center" });
@@ -146,7 +143,7 @@ def press(tab: Tab, key: str, text: str) -> None:
 
 
 def test_space_and_enter_do_what_the_part_in_focus_is_for(tab: Tab):
-    tab.run(WAIT + "choose(1); await until(() => player.clip?.isDone && player.fish.id === 1);")
+    tab.run(FIRST_OPEN)
     tab.run("document.getElementById('goes-on').focus()")
     press(tab, " ", " ")
     assert tab.run("return document.getElementById('goes-on').checked") is False
@@ -163,10 +160,8 @@ def test_space_and_enter_do_what_the_part_in_focus_is_for(tab: Tab):
 
 def test_a_key_pressed_twice_while_a_verdict_is_saved_decides_once(tab: Tab, out: Path):
     left = tab.run(
-        WAIT
+        FIRST_OPEN
         + """
-        choose(1);
-        await until(() => player.clip?.isDone && player.fish.id === 1);
         const answer = window.fetch;
         window.fetch = async (...asked) => {
           await new Promise((done) => setTimeout(done, asked[0] === "verdict" ? 300 : 0));

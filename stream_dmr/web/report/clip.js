@@ -16,8 +16,9 @@ function bindKey(name, key) {
 
 function clipPane() {
   const button = (id, onclick, ...label) => element("button", { type: "button", id, onclick }, ...label);
+  const named = (ariaLabel, sign) => Object.assign(sign, { ariaLabel });
   return element("div", { id: "clip-pane" }, CLIP_CANVAS,
-    element("div", { className: "bar" }, CLIP_PLAY, element("button", { type: "button", id: "clip-back", "aria-label": "Frame before", onclick: () => stepFrame(-1) }, "\u2039"), CLIP_SLIDER, element("button", { type: "button", id: "clip-on", "aria-label": "Next frame", onclick: () => stepFrame(1) }, "\u203a")),
+    element("div", { className: "bar" }, CLIP_PLAY, named("Frame before", button("clip-back", () => stepFrame(-1), "\u2039")), CLIP_SLIDER, named("Next frame", button("clip-on", () => stepFrame(1), "\u203a"))),
     element("div", { className: "bar" },
       button("clip-zoom", toggleZoom, ...bindKey("Zoom", "z")), button("clip-outlines", toggleOutlines, ...bindKey("Outlines", "o")),
       button("clip-earlier", () => shiftClip(-1), ...bindKey("Earlier", "<")), button("clip-later", () => shiftClip(1), ...bindKey("Later", ">")), CLIP_TEXT));
