@@ -83,6 +83,13 @@ def calibrate(
         raise UserError(
             f"--camera: expected with --lens alone, got {camera} without it; leave it out"
         )
+    if lens is not None or ends is not None:
+        for option, value in (("--model", model), ("--corners", corners)):
+            if value not in ("auto", None):
+                raise UserError(
+                    f"{option}: expected with photographs alone, got {value} with "
+                    f"{'--ends' if lens is None else '--lens'}; leave it out"
+                )
     if ends is not None or length_mm is not None or focal_35mm is not None:
         if ends is None or length_mm is None or images or (lens is None) == (focal_35mm is None):
             raise UserError(
@@ -96,11 +103,6 @@ def calibrate(
         raise UserError(
             "expected photographs of the board to calibrate the lens with, or --lens FILE with a "
             f"lens that is known, got {'neither' if lens is None else 'both'}"
-        )
-    if lens is not None and model != "auto":
-        raise UserError(
-            f"--model: expected with photographs alone, got {model} with --lens, whose file says "
-            "which lens it is; leave it out"
         )
     require_writable(out, overwrite=overwrite)
     printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)

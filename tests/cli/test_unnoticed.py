@@ -291,6 +291,10 @@ def test_setup_speaks_of_compiling_where_it_compiles(
 
 NOTHING = {
     "calibrate --plane p.jpg a.jpg --camera left": "--camera: expected with --lens alone",
+    "calibrate --plane p.jpg --lens a.yaml --corners x": "--corners: expected with photographs",
+    "calibrate --plane p.jpg --ends 1,2,3,4 --length-mm 9 --focal-35mm 26 --model fisheye": (
+        "--model: expected with photographs"
+    ),
     "view REC --frame 3": "--frame: expected with --screenshot alone",
     "view REC --port 8000": "--port: expected with --web alone",
     "view REC --screenshot a.jpg": "end it in .png",
