@@ -344,7 +344,8 @@ def _localize_by_two(
     if pairing.apart > _RAYS_WARN:
         observer.warn(
             f"the rays to a fish's ends pass {pairing.apart:.1%} of its length apart, usually "
-            f"{_RAYS_USUAL:.1%}: has a camera been moved since its calibration?"
+            f"{_RAYS_USUAL:.1%}: lengths may be further off than their intervals say; has a camera "
+            "been moved since its calibration, or are the calibrations of different planes?"
         )
     settings, common = setup.config.fit_mesh, None
     if settings.scans_sizes:  # the paper's solver and blend are left as in the paper
