@@ -20,6 +20,7 @@ from stream_dmr.pipeline.config import (
     toml_value,
 )
 from stream_dmr.pipeline.learn_shapes import learnt_from
+from stream_dmr.pipeline.run_inputs import plane_notices
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import STAGES, Setup
@@ -68,6 +69,16 @@ def replay_config(
     if given is None:
         return recorded
     mine = load_config(given)
+    for option, table, key, value in (
+        ("--pose lying", "localize", "rests_on_plane", True),
+        ("--stills", "track_fish", "across_frames", False),
+    ):
+        was, now = getattr(recorded, table), getattr(mine, table)
+        if getattr(was, key) == value != getattr(now, key) and key in now.model_fields_set:
+            on_notice(
+                f"--config {given}: [{table}] {key} = {toml_value(not value)}, so the run with "
+                f"{option} is replayed without its settings; leave this line out to keep them"
+            )
     config = _in_conditions_of(recorded, mine)
     changes: dict[str, object] = {}
     unused: list[str] = []
@@ -205,6 +216,14 @@ def read_inputs(
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
         _require_size_of_frames(calibration, recording)
+        if not config.localize.rests_on_plane:
+            for line in plane_notices(calibration, config):
+                observer.warn(line)
+        if request.first == "localize" and config.fit_mesh.hang == "plane":
+            observer.warn(
+                "--from localize: the fits take fish to be along the recorded calibration's plane; "
+                "if the new one leans otherwise, use --from fit"
+            )
     files = None
     if request.first == "crop":
         files = find_crop_files(

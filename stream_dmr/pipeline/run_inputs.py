@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
+from stream_dmr.camera import Calibration
 from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.files import without_password
 from stream_dmr.fitting.shape.candidates import given_mesh, load_shapes
@@ -244,27 +245,32 @@ def start_notices(inputs: Inputs) -> Iterator[str]:
     if inputs.calibration is None:
         yield "without --calibration there are relative shapes, no millimetres"
     elif inputs.request.pose == "hanging":
-        distance_m = inputs.calibration.plane.distance_mm / 1000
-        if not _USUAL_M[0] <= distance_m <= _USUAL_M[1]:
-            yield (
-                f"the calibration's reference plane is {distance_m:.2f} m from the camera; if it "
-                "is not, every length is wrong: tvec must be in mm"
-            )
-        lean_rad = inputs.calibration.plane.lean_rad
-        if lean_rad > _LARGEST_LEAN_RAD:
-            degrees, hang = f"{np.degrees(lean_rad):.0f} degrees", inputs.config.fit_mesh.hang
-            yield (
-                f"the calibration's reference plane leans {degrees} from facing the camera; "
-                + (
-                    "fish are taken to face the camera: where they hang in that plane, lengths are "
-                    f'up to {1 - np.cos(lean_rad):.0%} short: set [fit_mesh] hang = "plane"'
-                    if hang == "camera"
-                    else "fish are taken to hang in it: where they face the camera, lengths are "
-                    f'up to {1 / np.cos(lean_rad) - 1:.0%} long: set [fit_mesh] hang = "camera"'
-                )
-            )
+        yield from plane_notices(inputs.calibration, inputs.config)
     if inputs.source.is_live and inputs.config.recording.frames == "reference":
         yield (
             "a live source can't be read again, so its pictures are not kept but for the view and "
             'a few of each fish; record them with [recording] frames = "jpeg" or "h264"'
+        )
+
+
+def plane_notices(calibration: Calibration, config: Config) -> Iterator[str]:
+    """Lines on a reference plane that is unlikely for hanging fish."""
+    distance_m = calibration.plane.distance_mm / 1000
+    if not _USUAL_M[0] <= distance_m <= _USUAL_M[1]:
+        yield (
+            f"the calibration's reference plane is {distance_m:.2f} m from the camera; if it "
+            "is not, every length is wrong: tvec must be in mm"
+        )
+    lean_rad = calibration.plane.lean_rad
+    if lean_rad > _LARGEST_LEAN_RAD:
+        yield (
+            f"the calibration's reference plane leans {np.degrees(lean_rad):.0f} degrees from "
+            "facing the camera; "
+            + (
+                "fish are taken to face the camera: where they hang in that plane, lengths are "
+                f'up to {1 - np.cos(lean_rad):.0%} short: set [fit_mesh] hang = "plane"'
+                if config.fit_mesh.hang == "camera"
+                else "fish are taken to hang in it: where they face the camera, lengths are "
+                f'up to {1 / np.cos(lean_rad) - 1:.0%} long: set [fit_mesh] hang = "camera"'
+            )
         )

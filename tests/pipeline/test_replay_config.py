@@ -58,8 +58,11 @@ def test_a_file_keeps_the_conditions_of_the_run(mine: Path, tmp_path: Path, firs
     assert kept == run.model_copy(update={"smooth_length": smooth})
     path = tmp_path / "hanging.toml"
     path.write_text("[localize]\nrests_on_plane = false\n")
-    hangs = replay_config(path, to_toml(run), first="crop")
+    lines: list[str] = []
+    hangs = replay_config(path, to_toml(run), first="crop", on_notice=lines.append)
     assert hangs.localize == Config().localize
+    [line] = lines
+    assert "rests_on_plane = false, so the run with --pose lying is replayed without" in line
 
 
 @pytest.mark.parametrize("first", STAGES)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
@@ -73,6 +74,27 @@ def test_a_given_calibration_replaces_the_recorded_one(
     assert written.calibration_file == path.read_bytes()
     assert written.command == "stream-dmr replay"
     assert written.source == recording.header.source
+
+
+def test_a_given_calibration_whose_plane_is_unlikely_is_named_as_by_a_run(
+    recording: Recording, folder: Path, tmp_path: Path
+):
+    lines: list[str] = []
+
+    class Lines(RunObserver):
+        def warn(self, line: str) -> None:
+            lines.append(line)
+
+    leaning = Rotation.from_euler("x", 35, degrees=True).as_matrix()
+    plane = replace(calibration().plane, rotation=leaning, translation_mm=np.array([0, 0, 200.0]))
+    path = tmp_path / "near.yaml"
+    save_calibration(path, replace(calibration(), plane=plane))
+    request = ReplayOptions(recordings=[folder], calibration=path, first="localize")
+    hang = read_inputs(request, recording, Lines()).config.fit_mesh.hang
+    said = " ".join(lines)
+    assert "tvec must be in mm" in said
+    assert "leans 35 degrees" in said
+    assert ("use --from fit" in said) == (hang == "plane")
 
 
 def test_no_shapes_are_learnt_where_the_settings_have_none(
