@@ -234,17 +234,26 @@ class DailyDigests:
         self._thread = threading.Thread(target=self._watch, name="digests", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Stop, once a digest in progress is noted. Idempotent."""
+    def close(self, *, is_complete: bool = False) -> None:
+        """Stop, once a digest in progress is noted. Idempotent.
+
+        `is_complete`: the source has ended, so no day has more to come, and all are written now.
+        """
         self._ended.set()
         self._thread.join()
+        if is_complete:
+            self._ended.clear()
+            self._try_to_write(is_complete=True)
 
-    def write_due(self) -> None:
-        """Write the missing digests of past days. Raises OutputError."""
-        out, today = self.store.path.parent, _day_of(self.now_ns() - _SETTLE_NS)
+    def write_due(self, *, is_complete: bool = False) -> None:
+        """Write the missing digests of past days, or of all days. Raises OutputError."""
+        out, days = self.store.path.parent, _days(self.store.path)[0]
+        today = _day_of(self.now_ns() - _SETTLE_NS)
+        if is_complete:
+            today = max(days, default=today) + timedelta(days=1)
         events = read_rows(self.store.path, EVENTS)
         written = {row["text"] for row in events if row["kind"] == _WRITTEN}
-        for day, count in sorted(_days(self.store.path)[0].items()):
+        for day, count in sorted(days.items()):
             path, text = self.folder / digest_name(day), f"digest of {day}: {count} fish"
             if day >= today or text in written or self._ended.is_set():
                 continue
@@ -256,7 +265,10 @@ class DailyDigests:
 
     def _watch(self) -> None:
         while not self._ended.wait(_LOOK_S):
-            try:
-                self.write_due()
-            except Exception as error:  # measuring continues
-                self.on_notice(f"[digest] could not be written, tried again later: {error}")
+            self._try_to_write()
+
+    def _try_to_write(self, *, is_complete: bool = False) -> None:
+        try:
+            self.write_due(is_complete=is_complete)
+        except Exception as error:  # measuring continues
+            self.on_notice(f"[digest] could not be written, tried again later: {error}")

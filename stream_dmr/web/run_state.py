@@ -203,6 +203,10 @@ class RunState:
         """True if a stage has worked on the same frame for more than `stuck_s`."""
         return self.chain is not None and self.chain.longest_busy_s() > self.stuck_s
 
+    def has_source_ended(self) -> bool:
+        """After the run: True if its source ended by itself, and no stop or error ended it."""
+        return self.chain is not None and not self.chain.stop.is_set()
+
     def _finish(self, estimate: LengthEstimate) -> None:
         self.finished.append(estimate)
         self.num_fish[without_counts(estimate.status)] += 1

@@ -185,7 +185,7 @@ class WatchObserver(RunObserver):
                 problems=state.problems,
                 on_notice=self.warn,
             )
-            self._opened.enter_context(closing(digests))
+            self._opened.callback(lambda: digests.close(is_complete=state.has_source_ended()))
         self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         self._state = state
 

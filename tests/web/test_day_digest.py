@@ -433,6 +433,16 @@ def test_what_the_disk_refuses_is_tried_again(
     assert "tried again later" in said[0]
 
 
+def test_only_a_source_that_ended_makes_the_last_day_whole(tmp_path: Path, folder: Path):
+    for is_complete, expected in ((False, []), (True, [str(DAY)]), (True, [])):
+        with Box(tmp_path / "out", folder) as box:
+            if not is_complete:
+                live(box.store, DAY, range(1, 3))
+            box.now_ns = noon(DAY) + 1
+            box.digests.close(is_complete=is_complete)
+            assert list(taken(folder)) == expected
+
+
 class WaitsForDigest(RunObserver):
     """Holds up the second clip until the digest of the first one has its two fish."""
 
@@ -466,7 +476,12 @@ def test_a_run_over_a_growing_folder_signs_a_digest_of_each_day(
     asked = request(clip, out := tmp_path / "out", source=str(tmp_path / "clips"), key=key)
     observer = WatchObserver(WaitsForDigest(path))
     measure_source(asked, stop=threading.Event(), observer=observer)
-    assert list(folder.iterdir()) == [path]  # the second day is not over
+    # No more clips came for the second day, so the run ended by itself.
+    last = folder / f"digest-{DAY + timedelta(days=1)}.zip"
+    assert sorted(folder.iterdir()) == [path, last]
+    assert [row[0] for row in content_of(last)["fish"][1:]] == [3, 4]
+    with zipfile.ZipFile(last) as archive:  # with the segments that the end closed
+        assert "pictures/3.webp" in archive.namelist()
     public = load_public_key(key.with_name("device.pub"))
     content = read_digest(path, public)
     assert content is not None
