@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
@@ -69,17 +70,7 @@ def replay_config(
     if given is None:
         return recorded
     mine = load_config(given)
-    for option, table, key, value in (
-        ("--pose lying", "localize", "rests_on_plane", True),
-        ("--stills", "track_fish", "across_frames", False),
-    ):
-        was, now = getattr(recorded, table), getattr(mine, table)
-        if getattr(was, key) == value != getattr(now, key) and key in now.model_fields_set:
-            on_notice(
-                f"--config {given}: [{table}] {key} = {toml_value(not value)}, so the run with "
-                f"{option} is replayed without its settings; leave this line out to keep them"
-            )
-    config = _in_conditions_of(recorded, mine)
+    config = _in_conditions_of(recorded, mine, given, on_notice)
     changes: dict[str, object] = {}
     unused: list[str] = []
     for table, stages in _stages_before(first, config).items():
@@ -100,14 +91,29 @@ def replay_config(
     return config.model_copy(update=changes)
 
 
-def _in_conditions_of(recorded: Config, given: Config) -> Config:
-    """The given settings, with those of --pose lying and --stills if the run had these."""
+def _in_conditions_of(
+    recorded: Config, given: Config, path: Path, on_notice: Callable[[str], None]
+) -> Config:
+    """The given settings, with those of --pose lying and --stills if the run had these.
+
+    `on_notice` gets a line on an option that the file at `path` takes away.
+    """
     config = given
-    if recorded.localize.rests_on_plane and "rests_on_plane" not in given.localize.model_fields_set:
-        config = lying(config)
-    is_stills = not recorded.track_fish.across_frames
-    if is_stills and "across_frames" not in given.track_fish.model_fields_set:
-        config = stills(config, is_calibrated=True)  # the size of pictures stays as recorded
+    for option, table, key, value, with_option in (
+        ("--pose lying", "localize", "rests_on_plane", True, lying),
+        # The size of pictures stays as recorded.
+        ("--stills", "track_fish", "across_frames", False, partial(stills, is_calibrated=True)),
+    ):
+        mine = getattr(given, table)
+        if getattr(getattr(recorded, table), key) != value:
+            continue
+        if key not in mine.model_fields_set:
+            config = with_option(config)
+        elif getattr(mine, key) != value:
+            on_notice(
+                f"--config {path}: [{table}] {key} = {toml_value(not value)}, so the run with "
+                f"{option} is replayed without its settings; leave this line out to keep them"
+            )
     return config
 
 

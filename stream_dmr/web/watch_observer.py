@@ -173,6 +173,8 @@ class WatchObserver(RunObserver):
                 alerts, run=out.resolve().name, problems=state.problems, on_notice=self.warn
             )
             self._opened.enter_context(closing(sender))
+        # Closed after the digests: from STOPPING on systemd waits for TimeoutStopSec alone.
+        self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         if config.digest.folder and inputs.source.is_endless:
             from stream_dmr.web.day_digest import DailyDigests  # with the views of a report
 
@@ -186,7 +188,6 @@ class WatchObserver(RunObserver):
                 on_notice=self.warn,
             )
             self._opened.callback(lambda: digests.close(is_complete=state.has_source_ended()))
-        self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         self._state = state
 
     def attach(self, chain: Chain) -> None:
