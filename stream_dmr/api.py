@@ -75,7 +75,7 @@ class RecordedRun:
         A frame recorded by reference has an image of shape (0, 0, 3). RecordingError if the
         recording is damaged; an end cut off by a crash is logged as a warning, and the rest read.
         """
-        recording = open_recordings(self.paths)
+        recording = open_recordings(self.paths, of_all_runs=True)
         for message, _ in decoded_messages(recording, self.kinds, self.selection):
             yield message
         for line in recording.warnings:
@@ -164,7 +164,7 @@ def open(
     """
     selection = _selection(time_s, tracks)
     paths = _paths(recordings)
-    header = open_recordings(paths).header
+    header = open_recordings(paths, of_all_runs=True).header
     return RecordedRun(
         paths=paths,
         kinds=get_args(Message) if kinds is None else kinds,

@@ -83,7 +83,7 @@ def learn_template(
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
     require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
-    opened = [open_recordings([path]) for path in recordings]
+    opened = [open_recordings([path], of_all_runs=True) for path in recordings]
     header = opened[0].header
     settings = settings_of(config, header.config_toml, recordings[0])
     mesh, forms = load_shapes(

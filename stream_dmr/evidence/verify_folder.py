@@ -32,10 +32,9 @@ from stream_dmr.evidence.seal import (
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.verify_batch import check_batch
 from stream_dmr.files import is_locked, sha256_of
-from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish, track_of
 from stream_dmr.recording.mcap.mcap_recording import is_torn
-from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
+from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.recording.repair import DAMAGED
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.batch_folder import VIDEOS
@@ -48,7 +47,6 @@ from stream_dmr.store.edits import (
     edits_of,
     frames_of_parts,
     frames_of_tracks,
-    settings_of,
 )
 from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.store.ledger import content_sha256, lines_sha256
@@ -125,7 +123,7 @@ def _corrections(
     database: Path, verdicts: Sequence[Verdict], corrections: Sequence[tuple[int, Verdict]]
 ) -> Iterator[str]:
     """Compute each corrected length again, from all points of its fish that were set until then."""
-    recording = open_recordings([database.parent])
+    recording = open_recordings([database.parent], of_all_runs=True)
     fish = Selection(tracks=frozenset(verdict.track_id for _, verdict in corrections))
     wanted = {(verdict.track_id, verdict.frame_index) for _, verdict in corrections}
     fits = {
@@ -133,7 +131,6 @@ def _corrections(
         for fit in ReviewedMessages(recording, database, fish).of(FittedMesh)
         if (fit.track_id, fit.frame_index) in wanted
     }
-    localizing = recorded_settings(recording.header, "localize", LocalizeSettings)
     for number, verdict in corrections:
         said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
         of_reader = blind_readings(said).get(verdict.reviewer, [])
@@ -150,17 +147,14 @@ def _corrections(
         try:
             frames = {
                 frame: corrected_fish(
-                    fits[verdict.track_id, frame],
-                    np.array(points, float),
-                    settings=localizing,
-                    calibration=recording.header.calibration,
+                    recording, fits[verdict.track_id, frame], np.array(points, float)
                 )
                 for frame, points in moved.items()
             }
         except UserError as error:
             yield f"{name}: {error}"
             continue
-        length = corrected_length(frames, settings_of(recording))
+        length = corrected_length(recording, frames)
         for column in ("length_mm", "length_std_mm"):
             now, was = getattr(verdict, column), getattr(length, column)
             if now is None or was is None or not math.isclose(now, was, rel_tol=1e-9):
@@ -169,8 +163,7 @@ def _corrections(
 
 def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) -> Iterator[str]:
     """Compare each fish with the length by its frames, if the recording still has them all."""
-    recording = open_recordings([database.parent])
-    settings = settings_of(recording)
+    recording = open_recordings([database.parent], of_all_runs=True)
     tracks = {part.track_id for fish in edits.fish.values() for part in fish.parts}
     frames = frames_of_tracks(recording, database, tracks, last_frames)
     for track_id, edited in edits.fish.items():
@@ -181,7 +174,7 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
             continue
         if len(chosen) < edited.row["frames_seen"] and any(database.parent.glob("recording-*")):
             continue  # the oldest segments of a camera are deleted if room is short
-        expected = edited_row(chosen, settings, ()) if chosen else {}
+        expected = edited_row(recording, chosen, ()) if chosen else {}
         for name, now in edited.row.items():
             if name not in _NOT_COMPUTED and now != expected.get(name):
                 yield f"fish {track_id}: {name} is {now}, its frames give {expected.get(name)}"

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -38,7 +38,9 @@ from stream_dmr.pipeline.run_inputs import species_notes
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.reading import (
     decoded_messages,
+    header_at,
     messages_of,
+    part_at,
     require_messages,
     require_time,
     require_tracks,
@@ -54,6 +56,7 @@ from stream_dmr.store.open_results import open_results, require_recording
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, write_lengths
 from stream_dmr.store.scale_checks import last_checks
+from stream_dmr.template.template import Template
 
 Stage = TypeVar("Stage", FishCrop, FittedMesh)
 
@@ -111,13 +114,13 @@ class Export:
         long.
         """
         self._require_writable(needed_for="--meshes")
-        faces, count = self.header.template.faces, 0
-        restored = MeshRebuilder.of(self.recording)
+        meshes, count = cache(MeshRebuilder.of), 0
         for fit, fish in self._localized(FittedMesh):
-            shape = restored.with_vertices(fit).shape
+            part = part_at(self.recording, fit.frame_index)
+            shape = meshes(part).with_vertices(fit).shape
             vertices = None if shape is None else place_fit(shape, fish)[0]
             if vertices is not None:
-                mesh = trimesh.Trimesh(vertices, faces, process=False)
+                mesh = trimesh.Trimesh(vertices, part.header.template.faces, process=False)
                 target = out / f"fish-{fit.track_id}" / f"{fit.frame_index:06d}.{format}"
                 self._require_writable(target)
                 with self._writing(target):
@@ -209,9 +212,11 @@ class Export:
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        template, settings = self.header.template, config.fisheries
-        records = [fish_record(fish, template, settings, checks) for fish in self._fish]
-        self.notes += species_notes(config, template) or unweighed_note(records, settings)
+        settings = config.fisheries
+        records = [fish_record(fish, self._template(fish), settings, checks) for fish in self._fish]
+        self.notes += species_notes(config, self.header.template) or unweighed_note(
+            records, settings
+        )
         with self._writing(path):
             if format == "csv":
                 write_csv(path, FISH_TABLE if all_columns else used_columns(records), records)
@@ -230,7 +235,7 @@ class Export:
         text, count = viame_csv(
             self._counted(),
             {fish.estimate.track_id: fish for fish in self._fish},
-            self.header.template,
+            self._template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
             pictures={
                 frame.frame_index: frame.source for frame in frames if is_picture(frame.source)
@@ -260,7 +265,7 @@ class Export:
     def agency(self, out: Path, agency: Agency) -> list[Path]:
         """Write the tables of AGENCIES and AGENCY_TEXTS; rejected fish and doubles are left out."""
         fish = [
-            (caught, template_of(caught, self.header.template))
+            (caught, template_of(caught, self._template(caught)))
             for caught in self._fish
             if caught.counts
         ]
@@ -302,6 +307,10 @@ class Export:
     @cached_property
     def _fish(self) -> list[Fish]:
         return read_fish(self._path, self.recording, self._selection)
+
+    def _template(self, fish: Fish) -> Template:
+        """The template by which a fish was measured."""
+        return header_at(self.recording, fish.estimate.last_frame).template
 
     @cached_property
     def _left_out(self) -> set[int]:

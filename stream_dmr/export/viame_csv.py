@@ -8,7 +8,7 @@ Pixels are counted from the picture's corner.
 """
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from io import StringIO
 
@@ -39,7 +39,7 @@ _OF_BOX = ("length_mm", "length_std_mm", "reason")  # of LocalizedFish
 def viame_csv(
     seen: Iterable[tuple[FishCrop, LocalizedFish]],
     fish: Mapping[int, Fish],
-    template: Template,
+    template_of: Callable[[Fish], Template],
     *,
     fps: float | None,
     pictures: Mapping[int, str],
@@ -56,7 +56,9 @@ def viame_csv(
         row = _row(crop, located, known, pictures.get(located.frame_index))
         if located.track_id not in told:
             told.add(located.track_id)
-            record = {} if known is None else fish_record(known, template, FisheriesSettings())
+            record = {}
+            if known is not None:
+                record = fish_record(known, template_of(known), FisheriesSettings())
             row += _attributes("trk-atr", {name: record.get(name) for name in _OF_TRACK})
             row += [PART] if is_part else []
         rows.append(row)

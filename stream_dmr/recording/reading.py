@@ -1,9 +1,11 @@
 """Open recordings, iterate over their messages, and require what a command needs."""
 
 import tomllib
+from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
+from functools import cached_property
+from itertools import chain, groupby, pairwise
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -25,9 +27,9 @@ M = TypeVar("M", bound=Message)
 
 @runtime_checkable
 class Recording(Protocol):
-    """An opened recording: one file, or the segments of one run."""
+    """An opened recording: one file, or the segments of runs that went on in one folder."""
 
-    header: RunHeader
+    header: RunHeader  # of the last run; `header_at` has the header of a frame
     metadata: dict[str, str]  # the software that recorded it, with versions
     is_thinned: bool  # its pictures and masks were removed to free disk space
     ends_early: bool  # a segment, or cut off by a crash: the run went on after its end
@@ -58,11 +60,12 @@ class Recording(Protocol):
         ...
 
 
-def open_recordings(paths: Sequence[Path]) -> Recording:
+def open_recordings(paths: Sequence[Path], *, of_all_runs: bool = False) -> Recording:
     """One recording of all paths: files, and folders of a run or of its segments.
 
     Segments of one folder are read in the order of their names, however they are given. Raises
-    RecordingError if one can't be read or is given twice, or if they are not of the same run.
+    RecordingError if one can't be read or is given twice, or, without `of_all_runs`, if one has
+    another config, template or calibration than the others: a run may go on with others.
     """
     files = [file for path in paths for file in files_of(path)]
     if not files:
@@ -72,7 +75,19 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
             raise RecordingError(f"{file}: expected a recording, got a pipe or a device")
     files = _in_order(files)
     segments = [RrdRecording(f) if f.suffix == ".rrd" else McapRecording(f) for f in files]
-    return segments[0] if len(segments) == 1 else _Segments(files, segments)
+    if not of_all_runs:
+        _require_one_header(files, segments)
+    return segments[0] if len(segments) == 1 else _Segments(segments)
+
+
+def _require_one_header(files: Sequence[Path], segments: Sequence[Recording]) -> None:
+    for (before, first), (file, second) in pairwise(zip(files, segments, strict=True)):
+        one, other = first.header.attachments(), second.header.attachments()
+        if differ := {name for name in one | other if one.get(name) != other.get(name)}:
+            raise RecordingError(
+                f"{file}: expected the {', '.join(sorted(differ))} of {before}, got another: a run "
+                "went on with it; give the recordings before this one and those from it on apart"
+            )
 
 
 def decoded_messages(
@@ -127,21 +142,28 @@ def _in_order(files: Sequence[Path]) -> Sequence[Path]:
 
 
 class _Segments:
-    """The segments of a run, in order, as one recording."""
+    """Segments, in order, as one recording."""
 
-    def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
+    def __init__(self, segments: Sequence[Recording]) -> None:
         self._segments = segments
         runs = joined_runs(segment.header for segment in segments)
-        self.header = replace(segments[0].header, runs=runs)
+        self.header = replace(segments[-1].header, runs=runs)
         self.metadata = segments[0].metadata
         self.ends_early = any(segment.ends_early for segment in segments)
         self.is_thinned = any(segment.is_thinned for segment in segments)
-        for file, segment in zip(files, segments, strict=True):
-            if segment.header.checksum != self.header.checksum:
-                raise RecordingError(
-                    f"{file}: expected a segment of the same run as {files[0]}, got one with "
-                    "another config, template or calibration; replay them one by one"
-                )
+
+    @cached_property
+    def parts(self) -> Sequence[Recording]:
+        """The segments with the same config, template and calibration, together."""
+        by_header = groupby(self._segments, key=lambda segment: segment.header.checksum)
+        groups = [[*segments] for _, segments in by_header]
+        return [group[0] if len(group) == 1 else _Segments(group) for group in groups]
+
+    @cached_property
+    def starts(self) -> Sequence[tuple[int, Recording]]:
+        """The first frame of each part that has frames, and the part."""
+        firsts = ((next(messages_of(part, Frame), None), part) for part in self.parts)
+        return [(first.frame_index, part) for first, part in firsts if first is not None]
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -159,6 +181,19 @@ class _Segments:
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
         return chain.from_iterable(segment.video(selection) for segment in self._segments)
+
+
+def part_at(recording: Recording, frame_index: int) -> Recording:
+    """The part of a recording in which a frame is: it has one config, template and calibration."""
+    if not isinstance(recording, _Segments) or len(recording.parts) == 1:
+        return recording
+    number = bisect_right(recording.starts, frame_index, key=lambda start: start[0])
+    return recording.starts[max(number - 1, 0)][1] if recording.starts else recording
+
+
+def header_at(recording: Recording, frame_index: int) -> RunHeader:
+    """The config, template and calibration by which a frame was measured."""
+    return part_at(recording, frame_index).header
 
 
 def require_messages(recording: Recording) -> None:

@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_record import TrackLength
@@ -31,7 +30,13 @@ from stream_dmr.messages import (
     Message,
 )
 from stream_dmr.recording.codec import decode
-from stream_dmr.recording.reading import Recording, decoded_messages, messages_of, recorded_settings
+from stream_dmr.recording.reading import (
+    Recording,
+    decoded_messages,
+    header_at,
+    messages_of,
+    recorded_settings,
+)
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.schema import fish_row
 from stream_dmr.store.verdicts import (
@@ -158,8 +163,10 @@ def changed_fish(before: TrackEdits, after: TrackEdits) -> set[int]:
 Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in order
 
 
-def settings_of(recording: Recording) -> SmoothLengthSettings:
-    return recorded_settings(recording.header, "smooth_length", SmoothLengthSettings)
+def settings_at(recording: Recording, frame_index: int) -> SmoothLengthSettings:
+    """The settings by which a fish whose last frame this is was measured."""
+    header = header_at(recording, frame_index)
+    return recorded_settings(header, "smooth_length", SmoothLengthSettings)
 
 
 def frames_of_tracks(
@@ -212,11 +219,7 @@ def length_of_frames(
 
 
 def corrected_fish(
-    fit: FittedMesh,
-    points_px: Float[np.ndarray, "2 2"],
-    *,
-    settings: LocalizeSettings,
-    calibration: Calibration | None,
+    recording: Recording, fit: FittedMesh, points_px: Float[np.ndarray, "2 2"]
 ) -> LocalizedFish:
     """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
 
@@ -228,7 +231,9 @@ def corrected_fish(
         raise UserError(f"frame {fit.frame_index} has no fit to correct: {fit.refusal}")
     keypoints_px = np.stack([points_px[0], shape.keypoints_px[1], points_px[1]])
     moved = replace(fit, shape=replace(shape, keypoints_px=keypoints_px))
-    fish = localize(moved, settings=settings, calibration=calibration)
+    header = header_at(recording, fit.frame_index)
+    settings = recorded_settings(header, "localize", LocalizeSettings)
+    fish = localize(moved, settings=settings, calibration=header.calibration)
     if fish.length_mm is None or fish.length_std_mm is None:
         raise UserError(
             f"frame {fit.frame_index}: these points give no length ({fish.reason}); set them on "
@@ -237,19 +242,20 @@ def corrected_fish(
     return replace(fish, accepted=True, reason="")
 
 
-def corrected_length(
-    frames: Mapping[int, LocalizedFish], settings: SmoothLengthSettings
-) -> LengthEstimate:
+def corrected_length(recording: Recording, frames: Mapping[int, LocalizedFish]) -> LengthEstimate:
     """The length from the corrected frames alone, filtered as in a run."""
-    of_points = settings.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
+    of_points = settings_at(recording, max(frames)).model_copy(
+        update={"min_frames": 1, "max_std_ratio": math.inf}
+    )
     return length_of_frames([frames[index] for index in sorted(frames)], of_points)[-1]
 
 
 def edited_row(
-    frames: Sequence[LocalizedFish], settings: SmoothLengthSettings, flags: Sequence[str]
+    recording: Recording, frames: Sequence[LocalizedFish], flags: Sequence[str]
 ) -> dict[str, Any]:
     """The row of `fish` that a run would have written for these frames."""
     ious = [fish.iou for fish in frames if fish.accepted and fish.iou is not None]
+    settings = settings_at(recording, frames[-1].frame_index)
     estimate = length_of_frames(frames, settings)[-1]
     return fish_row(estimate, flags) | {"iou": median(ious) if ious else None}
 
@@ -298,11 +304,12 @@ class ReviewedMessages:
         for message in self.of(LocalizedFish) if self.edits.fish else ():
             if message.track_id in self.edits.fish:
                 frames[message.track_id].append(message)
-        settings = settings_of(self._recording)
-        return {
-            fish: {each.frame_index: each for each in length_of_frames(of_fish, settings)[:-1]}
-            for fish, of_fish in frames.items()
-        }
+        running = dict[int, dict[int, LengthEstimate]]()
+        for fish, of_fish in frames.items():
+            settings = settings_at(self._recording, of_fish[-1].frame_index)
+            estimates = length_of_frames(of_fish, settings)[:-1]
+            running[fish] = {each.frame_index: each for each in estimates}
+        return running
 
     def _by_track(self) -> Selection:
         """The selection of the recorded tracks that the selected fish consist of."""

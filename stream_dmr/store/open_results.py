@@ -36,7 +36,7 @@ def open_results(path: Path, *, template: str = AUTO) -> Recording:
     """
     database = database_of(path)
     if database is None or _has_recording(path):
-        return open_recordings([path])
+        return open_recordings([path], of_all_runs=True)
     return LostRecording(database, template)
 
 

@@ -16,12 +16,11 @@ from stream_dmr.files import is_locked
 from stream_dmr.geometry import box_iou
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.config import parse_config
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.recording.codec import encode
 from stream_dmr.recording.frame_images import FoundFrame, FrameLookup
-from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.reading import known_shapes
+from stream_dmr.recording.reading import Recording, known_shapes, part_at
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.edits import (
     ReviewedMessages,
@@ -50,13 +49,14 @@ def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
 
 
 def measure_boxes(
-    found: Sequence[FoundFrame], drawn: Boxes, *, track_id: int, header: RunHeader, config: Config
+    found: Sequence[FoundFrame], drawn: Boxes, *, track_id: int, part: Recording
 ) -> tuple[list[AddedFrame], list[LocalizedFish], bool]:
     """Cut out, segment, fit and localize the fish of the boxes, as in `run --boxes`.
 
-    `found` are the frames from the first box to the last. The shapes are the run's, given or
-    learnt. Returns the frames to store, the fish in them, and True if they were measured on the
-    pixels of the run itself. Raises UserError if there are no pictures.
+    `found` are the frames from the first box to the last, `part` their part of the recording. The
+    shapes are the run's, given or learnt. Returns the frames to store, the fish in them, and True
+    if they were measured on the pixels of the run itself. Raises UserError if there are no
+    pictures.
     """
     pictures = [shown for shown in found if shown.frame.image.size]
     boxes = boxes_between(drawn, [shown.frame.frame_index for shown in pictures])
@@ -69,11 +69,12 @@ def measure_boxes(
     annotated = {
         index: [AnnotatedBox(track_id=track_id, bbox_xyxy_px=box)] for index, box in boxes.items()
     }
+    config = parse_config(part.header.config_toml, where="config.toml of the recording")
     setup = Setup(
         config=config,
-        template=header.template,
-        candidates=header.candidates,
-        calibration=header.calibration,
+        template=part.header.template,
+        candidates=known_shapes(part),
+        calibration=part.header.calibration,
     )
     crop_fish = CropFish(  # without the run's classifier of species: its file may be gone
         config.crop_fish, camera=setup.camera, finder=AnnotatedFish(boxes=annotated, masks=None)
@@ -193,18 +194,17 @@ class TrackEditor:
         self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
     ) -> TrackEdit:
         """Measure a missed fish in the drawn boxes; `time_ns`: times of the first and last box."""
-        new_fish = self._new_fish()
+        new_fish, part = self._new_fish(), part_at(report.recording, min(drawn))
         frames, fish, is_original = measure_boxes(
             list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
             drawn,
             track_id=new_fish,
-            header=replace(report.recording.header, candidates=known_shapes(report.recording)),
-            config=report.config,
+            part=part,
         )
         if not fish:
             raise UserError("verdict: expected boxes inside the picture, got none")
         flags = [ADDED, *([] if is_original else [OTHER_PIXELS])]
-        row = edited_row(fish, report.config.smooth_length, flags)
+        row = edited_row(report.recording, fish, flags)
         made = replace(
             verdict, track_id=new_fish, fish=json.dumps([row]), frames_sha256=frames_sha256(frames)
         )
@@ -225,7 +225,7 @@ class TrackEditor:
             known = [*flags.get(fish, ())]
             known += [flag for part in of_fish for flag in flags.get(part.track_id, ())]
             kept = list(dict.fromkeys(known))
-            rows.append(edited_row(chosen, report.config.smooth_length, kept))
+            rows.append(edited_row(report.recording, chosen, kept))
         return rows
 
     def _new_fish(self) -> int:

@@ -1,6 +1,7 @@
 """Make one self-contained HTML page about a run or a batch."""
 
 import math
+import sys
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ from stream_dmr.export.fish_table import fish_record
 from stream_dmr.fitting.shape.candidates import AUTO, describe, load_shapes
 from stream_dmr.lengths.fate import CONDITIONS, FATES
 from stream_dmr.pipeline.config import Config
-from stream_dmr.recording.reading import Recording, known_shapes
+from stream_dmr.recording.reading import Recording, header_at, known_shapes, part_at
 from stream_dmr.store.edits import NO_EDITS, TrackEdits
 from stream_dmr.store.effort import HaulEffort
 from stream_dmr.store.fish import Fish
@@ -208,7 +209,7 @@ def render_page(
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
     """A line for each stock that a run learnt, with its difference from its body form."""
-    shapes = known_shapes(report.recording)
+    shapes = known_shapes(part_at(report.recording, sys.maxsize))
     stocks = None if shapes is None else shapes.stocks()
     if stocks is None:
         return
@@ -258,7 +259,8 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: its row of fish.csv, and a thumbnail of its best view."""
-    record = fish_record(fish, report.recording.header.template, report.settings)
+    template = header_at(report.recording, fish.estimate.last_frame).template
+    record = fish_record(fish, template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
     views = report.views.get(fish.estimate.track_id, [])

@@ -282,17 +282,16 @@ class VerdictRecorder:
             tail_u=tail[0],
             tail_v=tail[1],
         )
-        config, calibration = self.report.config, self.report.recording.header.calibration
+        recording = self.report.recording
         frames = {
             frame_index: corrected_fish(
+                recording,
                 decode(FittedMesh, self._view(submitted.track_id, frame_index).fit),
                 np.array(points, float),
-                settings=config.localize,
-                calibration=calibration,
             )
             for frame_index, points in {**moved, **verdict.moved}.items()
         }
-        length = corrected_length(frames, config.smooth_length)
+        length = corrected_length(recording, frames)
         return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
     def _view(self, track_id: int, frame_index: int) -> RecordedView:

@@ -3,7 +3,8 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -24,12 +25,13 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, open_pictures
-from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
+from stream_dmr.recording.reading import Recording, decoded_messages, part_at, recorded_settings
 from stream_dmr.recording.selection import EVERYTHING
 from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.store.edits import ReviewedMessages
+from stream_dmr.template.template import Template
 
 _MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
 _KEYPOINTS_BGR = (60, 60, 255), (255, 255, 255), (255, 160, 60)  # head, center, tail
@@ -251,7 +253,7 @@ def draw_views(
     if path is not None and Path(path).is_file():
         with closing(FrameLookup(recording, path)) as found:
             return draw_views(tracks, recording, pictures=found)
-    meshes = MeshRebuilder.of(recording)
+    meshes = cache(MeshRebuilder.of)
     waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:
@@ -267,7 +269,11 @@ def draw_views(
     without = ((frame_index, None) for frame_index in list(waiting))
     for frame_index, image in chain(images, without):  # the first image of a frame is drawn
         for track_id, view in waiting.pop(frame_index, []):
-            drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
+            part = part_at(recording, frame_index)
+            drawn = _draw_view(view, meshes(part), part.header.template, image)
+            if not np.array_equal(part.header.template.faces, recording.header.template.faces):
+                drawn = replace(drawn, vertices=None)  # the page has the last template's faces
+            drawn_views[track_id].append(drawn)
     for drawn in drawn_views.values():
         drawn.sort(key=lambda view: view.recorded.rank, reverse=True)
     return drawn_views
@@ -276,13 +282,13 @@ def draw_views(
 def _draw_view(
     view: RecordedView,
     meshes: MeshRebuilder,
-    recording: Recording,
+    template: Template,
     frame: UInt8[np.ndarray, "H W 3"] | None,
 ) -> DrawnView:
     crop, fit = view.decode(meshes)
     shape = fit.shape
     assert shape is not None  # a view has keypoints
-    outlines = crop_outlines(crop, shape, recording.header.template.faces)
+    outlines = crop_outlines(crop, shape, template.faces)
     picture = crop_picture(crop, frame, size=_PICTURE_PX)
     size = crop.mask.shape[0]
     small = cv2.resize(picture, (2 * _THUMBNAIL_PX,) * 2, interpolation=cv2.INTER_AREA)

@@ -100,7 +100,7 @@ def test_viame_rows_have_box_length_species_and_outline():
     ends = np.array([[5.0, 15.0], [25.0, 15.0], [49.0, 15.0]])
     seen = replace(UNSEEN, keypoints_px=ends, accepted=False, reason="low iou")
     known = {7: replace(HALIBUT, review=Review(decision="accept", reason="clear, and whole"))}
-    text, count = viame_csv([(crop, seen)] * 2, known, TEMPLATE, fps=10.0, pictures={})
+    text, count = viame_csv([(crop, seen)] * 2, known, lambda _: TEMPLATE, fps=10.0, pictures={})
     assert count == 2
     head, fps, *rows = text.splitlines()
     assert head.startswith("# 1: Detection or Track-id,")
@@ -130,10 +130,12 @@ def test_viame_rows_have_box_length_species_and_outline():
 
 
 def test_a_picture_of_a_folder_has_its_name_and_no_rate_is_no_line():
-    text, _ = viame_csv([], {}, TEMPLATE, fps=None, pictures={})
+    text, _ = viame_csv([], {}, lambda _: TEMPLATE, fps=None, pictures={})
     assert len(text.splitlines()) == 1
     crop = replace(crop_from_mask(np.ones((60, 60), bool)), frame_camera=crop_camera(size=60))
-    text, _ = viame_csv([(crop, UNSEEN)], {}, TEMPLATE, fps=None, pictures={1: "IMG_7.jpg"})
+    text, _ = viame_csv(
+        [(crop, UNSEEN)], {}, lambda _: TEMPLATE, fps=None, pictures={1: "IMG_7.jpg"}
+    )
     assert text.splitlines()[1].startswith("7,IMG_7.jpg,0,")
 
 

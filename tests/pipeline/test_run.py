@@ -1,7 +1,5 @@
 """`stream-dmr run` from end to end on tiny clips: what it writes, and what a stop leaves."""
 
-import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -26,8 +24,10 @@ from tests.support.command import invoke, rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header, read_messages
 from tests.support.tiny_clip import (
+    add_clip,
     box_line,
     calibration,
+    clips_of,
     draw_mask,
     draw_picture,
     options,
@@ -254,25 +254,6 @@ def test_a_video_is_not_resumed_so_no_fish_counts_twice(tmp_path: Path, ended: s
     assert invoke("run", options | {"--overwrite": None}).code == 0
     assert [row["frames_seen"] for row in rows(out / "lengths.csv")] == ["12", "12"]
     assert_readable(out)
-
-
-def clips_of(folder: Path) -> dict[str, str]:
-    """Options that measure a folder with a clip of three frames, and masks for another one."""
-    options = write_clip(folder, fish=[[1, 2]] * 3)
-    for index in (4, 5, 6):
-        cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), draw_mask(index - 3, [1, 2]))
-    del options["--boxes"]
-    with Path(options["--config"]).open("a") as config:
-        config.write("\n[read_frames]\nclips_wait_s = 0\n")
-    (folder / "clips").mkdir()
-    add_clip(folder, "1.mp4")
-    return options | {"--source": str(folder / "clips")}
-
-
-def add_clip(folder: Path, name: str) -> None:
-    clip = folder / "clips" / name
-    shutil.copy(folder / "video.mp4", clip)
-    os.utime(clip, (1_700_000_000, 1_700_000_000))  # long ago, so that it is complete
 
 
 class AddsClip(RunObserver):

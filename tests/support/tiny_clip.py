@@ -1,5 +1,7 @@
 """A clip so small that the whole chain runs over it in seconds: a dark fish on a light ground."""
 
+import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,6 +55,25 @@ def write_clip(
     save_calibration(folder / "calibration.yaml", calibration())
     write_template(folder)
     return options(folder)
+
+
+def clips_of(folder: Path) -> dict[str, str]:
+    """Options that measure a folder with a clip of three frames, and masks for another one."""
+    options = write_clip(folder, fish=[[1, 2]] * 3)
+    for index in (4, 5, 6):
+        cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), draw_mask(index - 3, [1, 2]))
+    del options["--boxes"]
+    with Path(options["--config"]).open("a") as config:
+        config.write("\n[read_frames]\nclips_wait_s = 0\n")
+    (folder / "clips").mkdir()
+    add_clip(folder, "1.mp4")
+    return options | {"--source": str(folder / "clips")}
+
+
+def add_clip(folder: Path, name: str) -> None:
+    clip = folder / "clips" / name
+    shutil.copy(folder / "video.mp4", clip)
+    os.utime(clip, (1_700_000_000, 1_700_000_000))  # long ago, so that it is complete
 
 
 def options(folder: Path) -> dict[str, str]:

@@ -101,9 +101,9 @@ def test_a_split_fish_has_the_lengths_of_its_frames(queue: ReviewQueue, out: Pat
     whole = frames_of(out, 2)
     made = submit(queue, "split", 2, frame_index=5)
     assert {row["origin"] for row in made.values()} == {"split"}
-    settings = open_report(out).config.smooth_length
+    recording = open_report(out).recording
     for track_id, part in ((2, whole[:3]), (3, whole[3:])):
-        expected = edited_row(part, settings, ())
+        expected = edited_row(recording, part, ())
         assert made[track_id]["length_mm"] == expected["length_mm"]
         assert made[track_id]["frames_seen"] == len(part)
         detail = queue.detail(0, track_id)
@@ -139,8 +139,8 @@ def test_tracks_that_were_mixed_up_are_put_right(queue: ReviewQueue, out: Path):
     submit(queue, "split", 2, frame_index=3)
     made = submit(queue, "merge", 2, other_fish=3)  # frame 2 of one, 3 to 5 of the other
     first, second = frames_of(out, 1), frames_of(out, 2)
-    settings = open_report(out).config.smooth_length
-    expected = edited_row([*second[:1], *first[2:]], settings, ())
+    recording = open_report(out).recording
+    expected = edited_row(recording, [*second[:1], *first[2:]], ())
     assert (made[3]["length_mm"], made[3]["frames_seen"]) == (expected["length_mm"], 4)
     assert (made[2]["verdict"], made[2]["duplicate_of"]) == ("merge", 3)
     counted = [fish for fish in read_stored_fish(out / "lengths.db") if fish.counts]

@@ -89,13 +89,10 @@ def test_two_corrected_frames_are_put_together_as_a_run_does(judge: ReviewQueue,
         head, tail = crop_from_frame(
             points, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
         ).tolist()
-        header = report.recording.header
-        frames[fit.frame_index] = corrected_fish(
-            fit, points, settings=report.config.localize, calibration=header.calibration
-        )
+        frames[fit.frame_index] = corrected_fish(report.recording, fit, points)
         said = {"frame_index": fit.frame_index, "head": head, "tail": tail}
         row = submit(judge, track_id=1, kind="correct", **said)
-    together = corrected_length(frames, report.config.smooth_length)
+    together = corrected_length(report.recording, frames)
     assert row["corrected_length_mm"] == pytest.approx(together.length_mm, rel=1e-6)
     assert together.frames_used == 2
     submit(judge, track_id=1, kind="withdraw")
@@ -139,12 +136,7 @@ def test_head_and_tail_on_one_spot_give_no_length(judge: ReviewQueue, report: Ru
     _, fit, _ = ends(report, 1)
     assert fit.shape is not None
     with pytest.raises(UserError, match="give no length"):
-        corrected_fish(
-            fit,
-            fit.shape.keypoints_px[[2, 0]],  # the wrong way round
-            settings=report.config.localize,
-            calibration=report.recording.header.calibration,
-        )
+        corrected_fish(report.recording, fit, fit.shape.keypoints_px[[2, 0]])  # the wrong way round
 
 
 def serve(report: RunReport, *, reviewer: str, port: int = 0) -> ReviewServer:

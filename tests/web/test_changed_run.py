@@ -1,0 +1,105 @@
+"""A run that went on in its folder with another config, calibration and template."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from stream_dmr.calibration.calibration_file import save_calibration
+from stream_dmr.camera import ReferencePlane, crop_from_frame
+from stream_dmr.errors import RecordingError
+from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.export.exporter import Export
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import messages_of, open_recordings
+from stream_dmr.store.fish import read_measured_fish, read_stored_fish
+from stream_dmr.web.open_reports import open_report, write_report
+from stream_dmr.web.review_queue import ReviewQueue
+from tests.support.command import invoke
+from tests.support.tiny_clip import add_clip, calibration, clips_of, write_template
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fish 1 and 2 in frames 1 to 3; fish 3 and 4, the same, by the second run in frames 4 to 6."""
+    clip = tmp_path_factory.mktemp("changed") / "clip"
+    options = clips_of(clip)
+    assert invoke("run", options).code == 0
+    add_clip(clip, "2.mp4")
+    with (clip / "quick.toml").open("a") as config:
+        config.write("\n[smooth_length]\nmin_frame_std_ratio = 0.1\n\n[watch]\nport = 8099\n")
+    plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, 4000.0]))
+    save_calibration(clip / "calibration.yaml", replace(calibration(), plane=plane))
+    write_template(clip, "broad", half_breadth=22)
+    outcome = invoke("run", options | {"--template": str(clip / "broad.ply")})
+    assert outcome.code == 0, outcome.err
+    return Path(options["--out"])
+
+
+def lengths(out: Path) -> dict[int, float]:
+    estimates = [fish.estimate for fish in read_measured_fish(out / "lengths.db")]
+    return {one.track_id: one.length_mm for one in estimates if one.length_mm is not None}
+
+
+def test_each_fish_is_shown_and_exported_by_its_own_inputs(changed: Path, tmp_path: Path):
+    by_fish = lengths(changed)
+    assert by_fish[3] == pytest.approx(2 * by_fish[1], rel=0.1)
+    report = open_report(changed)
+    assert {caught.estimate.track_id for caught in report.fish} == set(report.views) == {1, 2, 3, 4}
+    assert write_report([report], tmp_path / "report.html", title="changed") > 0
+    Export(changed).meshes(tmp_path, format="ply")
+    spans = {
+        fish: np.ptp(trimesh.load_mesh(tmp_path / f"fish-{fish}" / f"{frame:06d}.ply").vertices, 0)
+        for fish, frame in ((1, 2), (3, 5))
+    }
+    for fish, span in spans.items():
+        assert span[1] == pytest.approx(by_fish[fish], rel=0.05)
+    assert spans[3][0] / spans[3][1] > 1.05 * spans[1][0] / spans[1][1]  # the broader mesh
+
+
+@pytest.mark.parametrize("fish", [1, 3])
+def test_a_reviewer_works_by_the_inputs_of_the_fish(changed: Path, fish: int):
+    report = open_report(changed)
+    queue = ReviewQueue([report], reviewer="Ada")
+    view = report.tracks[fish].views[0]
+    crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
+    assert fit.shape is not None
+    ends = crop_from_frame(
+        fit.shape.keypoints_px[[0, 2]], crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
+    )
+    said = {"kind": "correct", "track_id": fish, "frame_index": fit.frame_index}
+    head, tail = ends.tolist()
+    (row,) = queue.record(json.dumps(said | {"head": head, "tail": tail}).encode())["rows"]
+    assert row["corrected_length_mm"] == pytest.approx(lengths(changed)[fish], rel=0.05)
+
+    frame = fit.frame_index - fit.frame_index % 3 + 2  # the second of three
+    split = {"kind": "split", "track_id": fish + 1, "frame_index": frame}
+    made = queue.record(json.dumps(split).encode())["rows"]
+    (part,) = [row["id"] for row in made if row["id"] != fish + 1]
+    merge = {"kind": "merge", "track_id": part, "other_fish": fish + 1}
+    queue.record(json.dumps(merge).encode())
+    stored, measured = (
+        {one.estimate.track_id: one.estimate for one in read(changed / "lengths.db")}
+        for read in (read_stored_fish, read_measured_fish)
+    )
+    assert stored[fish + 1].length_std_mm == measured[fish + 1].length_std_mm
+    assert verify(changed)[0] == []
+
+
+def test_a_replay_of_two_configs_is_refused_and_each_part_can_be_replayed(
+    changed: Path, tmp_path: Path
+):
+    with pytest.raises(RecordingError, match=r"expected the calibration\.pb.*config\.toml.*apart"):
+        open_recordings([changed])
+    refused = invoke("replay", {str(changed): None, "--check": None})
+    assert refused.code != 0
+    for segment in sorted(changed.glob("recording-*.mcap")):
+        again = invoke("replay", {str(segment): None, "--check": None})
+        assert again.code == 0, again.err
+    last = open_recordings([changed], of_all_runs=True)
+    finals = [one for one in messages_of(last, LengthEstimate) if one.is_final]
+    assert {one.track_id: one.length_mm for one in finals} == lengths(changed)
