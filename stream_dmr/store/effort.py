@@ -18,7 +18,7 @@ class HaulEffort:
     """One haul, or the time outside of hauls with the name ""."""
 
     haul: str
-    began_ns: int | None = None  # on the clock of the frames; None: of no event
+    began_ns: int | None = None  # on the clock of the frames; None: unknown
     ended_ns: int | None = None
     hours_watched: float = 0.0  # with frames
     share_measured: float | None = None  # of the frames that came; None if unknown
@@ -50,10 +50,15 @@ def read_effort(
             efforts.append(outside)
         return efforts
     by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
-    return [
-        _effort(name, watched, [float(by_run.get(r["run_id"]) == name) for r in watched], fish)
-        for name in dict.fromkeys(by_run.values())
-    ]
+    efforts = list[HaulEffort]()
+    for name in dict.fromkeys(by_run.values()):
+        shares = [float(by_run.get(row["run_id"]) == name) for row in watched]
+        effort = _effort(name, watched, shares, fish)
+        of_haul = [row for row in rows if name and by_run.get(row["run_id"]) == name]
+        began_ns = min((row["first_ns"] for row in of_haul), default=None)
+        ended_ns = max((row["last_ns"] for row in of_haul), default=None)
+        efforts.append(replace(effort, began_ns=began_ns, ended_ns=ended_ns))
+    return efforts
 
 
 def watched_times(database: Path) -> list[int]:

@@ -129,7 +129,7 @@ def test_frames_that_were_lost_lower_the_share(tmp_path: Path):
 
 
 def test_a_pause_of_the_camera_is_not_watched(tmp_path: Path):
-    store = LengthStore(tmp_path, FACTS)
+    store = LengthStore(tmp_path, replace(FACTS, haul="7"))
     log = HaulLog(store, HaulsSettings())
     for second in (*range(0, 61), *range(1000, 1061)):
         log.take_frame(second * SECOND)
@@ -137,6 +137,9 @@ def test_a_pause_of_the_camera_is_not_watched(tmp_path: Path):
     store.close()
     (effort,) = read_effort(store.path, [])
     assert effort.hours_watched == pytest.approx(120 / 3600)
+    row = haul_row(effort, utc_zero_ns=1_795_327_200 * SECOND)
+    span = (row["began_utc"], row["ended_utc"])
+    assert span == ("2026-11-22T06:00:00.000Z", "2026-11-22T06:17:40.000Z")
 
 
 def test_hauls_by_rule(tmp_path: Path):
