@@ -40,13 +40,15 @@ def require_writable(
 def is_of_run(path: Path) -> bool:
     """True for the name of a file that a run writes into its folder.
 
-    An .rrd is one if the run's provenance lists it, or if there is no .mcap of the same content.
+    An .rrd is one if the run's provenance lists it, also after somebody removed it, or if there is
+    no .mcap of the same content.
     """
     folder = path.parent
     if not (folder / DATABASE).exists() and read_origin(folder) != folder:
         return False
-    if path.suffix == ".rrd" and path.exists():
-        return path.name in known_files(folder) or not path.with_suffix(".mcap").exists()
+    if path.suffix == ".rrd":
+        is_alone = path.exists() and not path.with_suffix(".mcap").exists()
+        return path.name in known_files(folder) or is_alone
     return has_run_name(path)
 
 

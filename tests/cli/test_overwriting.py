@@ -157,6 +157,15 @@ def test_shapes_that_a_run_learnt_are_its_results(out: Path, tmp_path: Path):
     assert not is_of_run(out / "template-of-mine.ply")
 
 
+def test_a_view_that_somebody_removed_stays_missing(out: Path, tmp_path: Path):
+    folder = shutil.copytree(out, tmp_path / "fish")
+    (folder / "recording.rrd").unlink()
+    outcome = invoke("convert", {str(folder): None})
+    assert (outcome.code, "that a run wrote" in outcome.err) == (2, True)
+    assert invoke("convert", {str(folder): None, "--out": str(folder / "again.rrd")}).code == 0
+    assert "recording.rrd: is missing" in invoke("verify", {str(folder): None}).out
+
+
 @pytest.mark.parametrize("command", ["run", "run --overwrite", "replay --from smooth --overwrite"])
 @pytest.mark.parametrize("kind", ["batch", "exports", "video"])
 def test_a_run_writes_nothing_into_a_batch_or_exports(
