@@ -253,10 +253,15 @@ def _files(signed: _Signed) -> Iterator[str]:
                 yield f"{name} is missing, and was signed"
         elif entry.kind == REMOVED or sha256_of(path) != entry.content_sha256:
             yield f"{name} is not as it was signed"
-    for pattern in RECORDINGS:
-        for path in sorted(signed.folder.glob(pattern)):
-            if path.name not in known:
-                yield f"{path.name} is not signed"
+    for path in sorted(_recordings(signed.folder)):
+        if path.name not in known:
+            yield f"{path.name} is not signed"
+
+
+def _recordings(folder: Path) -> set[Path]:
+    """What other commands take for recordings: views alone only where there is no .mcap."""
+    found = {path for pattern in RECORDINGS for path in folder.glob(pattern)}
+    return {path for path in found if path.suffix != ".rrd"} or found
 
 
 def _noted_files(signed: _Signed) -> Iterator[str]:
@@ -264,11 +269,8 @@ def _noted_files(signed: _Signed) -> Iterator[str]:
     for entry in signed.of(FOUND):
         yield f"{entry.name} was signed when a run found it, after a crash or renamed"
     known = {entry.name for entry in signed.of(*FILE_KINDS)}
-    own = {
-        path
-        for pattern in (*RECORDINGS, f"{DATABASE}*", PROVENANCE)
-        for path in signed.folder.glob(pattern)
-    }
+    own = _recordings(signed.folder)
+    own |= {path for name in (f"{DATABASE}*", PROVENANCE) for path in signed.folder.glob(name)}
     names = sorted(
         path.name
         for path in signed.folder.iterdir()

@@ -150,10 +150,11 @@ def test_verdicts_of_sql_are_named_and_computed_again(signed: Path, out: Path):
 
 
 def test_unsigned_files_and_the_run_are_named(signed: Path, out: Path):
-    for name in ("fish.csv", "template.ply"):
+    for name in ("fish.csv", "template.ply", "view.rrd"):  # beside the .mcap it is an export
         (out / name).write_text("x")
     found = verify(signed, out)
-    assert "not signed by the device: 'fish.csv', 'template.ply'" in found.out
+    assert "not signed by the device: 'fish.csv', 'template.ply', 'view.rrd'" in found.out
+    assert "view.rrd is not signed" not in found.out
     assert "vessel 'Sea Bird', source 'video.mp4'" in found.out
     assert "2 fish" in found.out
 
