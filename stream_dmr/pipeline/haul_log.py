@@ -52,6 +52,16 @@ class HaulLog:
         self._now_ns = 0  # capture time of the latest frame
         self._watched: dict[str, int] | None = None  # the next row of `watched`
         self._lost_before = 0
+        self._take_over()
+
+    def _take_over(self) -> None:
+        """Go on with a haul that the rule began and a crash left open: nobody else would end it."""
+        with suppress(OutputError):
+            haul, rows = self.current(), read_rows(self._store.path, HAULS)
+            ruled = {row["timestamp_ns"] for row in rows if row["said_by"] == _RULE}
+            if haul is not None and haul.began_ns in ruled:
+                lasts = (fish.last_timestamp_ns for fish in self._store.estimates())
+                self._ruled, self._last_fish_ns = haul.name, max([haul.began_ns, *lasts])
 
     def hauls(self) -> list[Haul]:
         """All hauls of the folder so far, also those that other programs wrote into it."""

@@ -16,6 +16,7 @@ from stream_dmr.pipeline.haul_log import HaulLog, write_haul
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.schema import HAULS, NAME, read_rows
 from stream_dmr.store.trip import haul_at, haul_values, hauls_of
 from tests.support.final_estimates import FACTS, fish
 
@@ -180,6 +181,22 @@ def test_a_rule_waits_for_the_fish_of_frames_before_a_pause(tmp_path: Path):
     log.finish()
     store.close()
     assert (haul.began_ns, haul.ended_ns) == (8, 23)
+
+
+def test_a_rule_goes_on_after_a_crash(tmp_path: Path):
+    """The haul that it began and never ended ends with the last fish, unless fish come soon."""
+    for number, time_s in enumerate((100.0, 200.0, 1000.0), start=1):
+        store = LengthStore(tmp_path, FACTS)
+        log = HaulLog(store, HaulsSettings(pause_min=5.0))
+        for second in range(round(time_s) - 2, round(time_s) + 2):
+            log.take_frame(second * SECOND)
+            log.frame_done()
+        log.take_fish(at(number, time_s))
+        store.add(at(number, time_s))
+        store.close()  # without log.finish()
+    first, second = hauls_of(read_rows(tmp_path / NAME, HAULS))
+    assert (first.began_ns, first.ended_ns) == (99 * SECOND, 201 * SECOND + 1)
+    assert (second.name, second.began_ns, second.ended_ns) == ("2", 999 * SECOND, None)
 
 
 def _position(second: int, knots: float) -> Position:
