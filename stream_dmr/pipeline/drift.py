@@ -195,7 +195,10 @@ class DriftAlarms:
     def __init__(
         self, store: LengthStore, settings: DriftSettings, *, on_notice: Callable[[str], None]
     ) -> None:
-        """References come from earlier runs in the store with the same calibration."""
+        """References come from earlier runs in the store with the same calibration.
+
+        Those of the fits with the same template as well: meshes of another fit otherwise.
+        """
         self._store = store
         self._on_notice = on_notice
         stored = store.scene()

@@ -322,12 +322,14 @@ class LengthStore:
         self._write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
 
     def first_ious(self, count: int) -> list[float]:
-        """The IoU of the first `count` fish that were measured here with this calibration."""
+        """The IoU of the first `count` fish here with this run's calibration and template."""
         query = (
             "SELECT iou FROM fish JOIN runs USING (run_id) "
-            "WHERE calibration_sha256 = ? AND iou IS NOT NULL ORDER BY number LIMIT ?"
+            "WHERE calibration_sha256 = ? AND template_sha256 = ? AND iou IS NOT NULL "
+            "ORDER BY number LIMIT ?"
         )
-        rows = self._rows.database.execute(query, (self._facts.calibration_sha256, count))
+        of_run = self._facts.calibration_sha256, self._facts.template_sha256
+        rows = self._rows.database.execute(query, (*of_run, count))
         return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:

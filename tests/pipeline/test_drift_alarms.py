@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,15 @@ def test_the_fish_of_earlier_runs_are_the_reference(store: LengthStore):
         store.add(fish(track_id), iou=0.93 + 0.001 * (track_id % 3))
     alarms = DriftAlarms(store, SETTINGS, on_notice=lambda line: None)
     assert flags_of(alarms, np.full(10, 0.85))[-1] != []
+
+
+def test_the_fish_of_another_template_are_no_reference(store: LengthStore, tmp_path: Path):
+    for track_id in range(1, 21):
+        store.add(fish(track_id), iou=0.93 + 0.001 * (track_id % 3))
+    store.close()
+    with closing(LengthStore(tmp_path, replace(FACTS, template_sha256="another"))) as later:
+        alarms = DriftAlarms(later, SETTINGS, on_notice=lambda line: None)
+        assert not any(flags_of(alarms, np.full(40, 0.85)))
 
 
 def test_the_first_static_scene_of_a_calibration_is_kept(store: LengthStore):
