@@ -200,7 +200,8 @@ class ClipFolder(Source):
         self._on_notice: Callable[[str], None] = self.warnings.append
         self._begun: set[str] = set()  # names of clips that were read, are being read or left out
         self._frames_done: dict[str, int] = {}
-        self._bytes_read: dict[str, int] = {}  # sizes of the clips when their reading began
+        self._read: dict[str, _FileState] = {}  # the clips when their reading began
+        self._rewritten: set[str] = set()  # names of clips that others replaced since
         self._after_ns = 0
         self._on_pause: Callable[[], None] = lambda: None
         self._clip_s = 0.0  # duration of the last clip
@@ -221,12 +222,11 @@ class ClipFolder(Source):
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
         while (path := self._next_clip()) is not None:
-            if path.name in self._bytes_read:
+            if path.name in self._read:
                 done = self._frames_done.get(path.name, 0)
                 self._on_notice(f"{path.name}: grew after its {done} frames were read")
             self._begun.add(path.name)
-            state = _state_of(path)
-            self._bytes_read[path.name] = 0 if state is None else state.num_bytes
+            self._read[path.name] = _state_of(path) or _FileState(num_bytes=0, modified_ns=0)
             self._video = self._open(path)
             if self._video is None:
                 continue
@@ -291,8 +291,21 @@ class ClipFolder(Source):
         """True for a clip that was not read, or has grown since."""
         if path.name not in self._begun:
             return True
-        state, num_bytes = _state_of(path), self._bytes_read.get(path.name)
-        return state is not None and num_bytes is not None and state.num_bytes > num_bytes
+        state, before = _state_of(path), self._read.get(path.name)
+        if state is None or before is None:
+            return False
+        later_s = (state.modified_ns - before.modified_ns) / 1e9
+        if state.num_bytes <= before.num_bytes and later_s > _SETTLE_S:
+            self._note_rewritten(path.name)
+        return state.num_bytes > before.num_bytes
+
+    def _note_rewritten(self, name: str) -> None:
+        if name not in self._rewritten:
+            self._rewritten.add(name)
+            self._on_notice(
+                f"{name}: was written again after it was read, and is not read again: give each "
+                "clip a name of its own, such as its time"
+            )
 
     def _next_clip(self) -> Path | None:
         """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""

@@ -175,6 +175,19 @@ def test_a_clip_that_grows_after_it_was_read_is_read_on(tmp_path: Path):
     assert folder.warnings == ["1.ts: grew after its 4 frames were read"]
 
 
+def test_a_clip_that_replaces_one_of_its_name_is_said(tmp_path: Path):
+    """As by a recorder that begins its names again: its fish would be missed in silence."""
+    for number in (1, 2):
+        clip(tmp_path / f"{number}.avi", first=number)
+    folder = ClipFolder(tmp_path, AT_ONCE)
+    frames = iter(folder)
+    first = list(itertools.islice(frames, 4))
+    os.utime(clip(tmp_path / "1.avi", first=1), (OLD_S + 60, OLD_S + 60))
+    assert numbers([*first, *frames]) == [1, 2, 3, 4, 2, 3, 4, 5]
+    assert len(folder.warnings) == 1
+    assert "1.avi: was written again after it was read" in folder.warnings[0]
+
+
 def test_closing_ends_the_wait_for_a_clip(tmp_path: Path):
     clip(tmp_path / "1.avi", first=1)
     folder = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=1e9))
