@@ -61,6 +61,17 @@ def test_clips_that_overlap_in_time_are_set_one_after_the_other(tmp_path: Path):
     assert {b - a for a, b in itertools.pairwise(times)} == {40_000_000}
 
 
+def test_clips_after_one_with_a_wrong_time_are_said_once(tmp_path: Path):
+    for number in (1, 2, 3, 4):
+        clip(tmp_path / f"{number}.avi", first=number)
+    os.utime(tmp_path / "2.avi", (OLD_S + 10**8,) * 2)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    times = [frame.timestamp_ns for frame in folder]
+    assert all(a < b for a, b in itertools.pairwise(times))
+    (warning,) = folder.warnings
+    assert warning.startswith("3.avi: by its time of change it is 99999997 s older")
+
+
 def test_a_clip_that_can_not_be_used_is_left_out(tmp_path: Path):
     clip(tmp_path / "1.avi", first=1)
     (tmp_path / "2.avi").write_bytes(bytes(range(256)) * 40)
