@@ -134,7 +134,11 @@ def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
             if caught.estimate.length_mm is not None:
                 measured[str(folder), caught.estimate.track_id] = caught.estimate.length_mm
         verdicts = read_verdicts(database)
-        by_reader = {REVIEW: verdicts} | blind_readings(verdicts)
+        blind = blind_readings(verdicts)
+        for taken in (REVIEW, MEASUREMENT):  # a blind reader may have this name
+            if taken in blind:
+                blind[f"{taken} (blind)"] = blind.pop(taken)
+        by_reader = {REVIEW: verdicts} | blind
         for name, own_verdicts in by_reader.items():
             found = reviews_of(own_verdicts)
             known = {(str(folder), track): r for track, r in found.items() if track in there}

@@ -98,6 +98,14 @@ def test_a_species_is_the_same_by_its_code_and_by_its_name(out: Path):
     assert (pairs["review", "Grace"].species.count, pairs["review", "Grace"].species.same) == (1, 1)
 
 
+def test_a_blind_reader_called_review_is_not_taken_for_the_review(out: Path):
+    submit(ReviewQueue([open_report(out)], reviewer="Ada"), "accept", 1)
+    blind = ReviewQueue([open_report(out, as_measured=True)], reviewer="review", blind=True)
+    submit(blind, "reject", 1, reason="glove")
+    decisions = {(pair.first, pair.second): pair.decisions for pair in agreements([out])}
+    assert decisions["review", "review (blind)"].count == 1
+
+
 def test_equal_seeds_draw_equal_fish(out: Path):
     queue = ReviewQueue([open_report(out)] * 2, reviewer="Ada", sample=AuditSample(size=2, seed=3))
     text = queue.page("x")
