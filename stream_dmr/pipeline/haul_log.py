@@ -137,8 +137,10 @@ class HaulLog:
             self._end_ruled(self._last_fish_ns)
 
     def _end_ruled(self, timestamp_ns: int) -> None:
-        if self._ruled is not None:
-            self._add(END, self._ruled, max(timestamp_ns, self._last_fish_ns) + 1, _RULE)
+        current = self.current() if self._ruled is not None else None
+        # A command may have ended that haul meanwhile, or begun another, which is not the rule's.
+        if current is not None and current.name == self._ruled:
+            self._add(END, current.name, max(timestamp_ns, self._last_fish_ns) + 1, _RULE)
         self._ruled = None
 
     def _add(self, what: str, name: str, timestamp_ns: int, said_by: str) -> None:

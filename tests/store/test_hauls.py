@@ -163,6 +163,24 @@ def test_hauls_by_rule(tmp_path: Path):
     assert [one.haul for one in read_stored_fish(store.path)] == ["1", "1", "2", "2", "3"]
 
 
+def test_a_rule_does_not_end_a_haul_that_a_command_began_during_its_own(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(pause_min=5.0))
+    for second in range(0, 600, 10):
+        log.take_frame(second * SECOND)
+        if second in (100, 200):
+            log.take_fish(at(second, second - 10.0))
+        if second == 160:
+            write_haul(tmp_path, "start", name="north", at="150", said_by="Ada")
+        log.frame_done()
+    current = log.current()
+    log.finish()
+    store.close()
+    assert current == log.current()
+    assert current is not None
+    assert current.name == "north"
+
+
 def test_a_rule_waits_for_the_fish_of_frames_before_a_pause(tmp_path: Path):
     """Two fish in view together, and the camera's next frame an hour later is there before them."""
     store = LengthStore(tmp_path, FACTS)
