@@ -30,6 +30,10 @@ class DecodingError(Exception):
     """The decoder returns no more pictures; the message has the reason."""
 
 
+class LateError(DecodingError):
+    """No picture came in time."""
+
+
 class ResizedError(DecodingError):
     """The next picture has another size than the first: `width` x `height` px."""
 
@@ -80,7 +84,7 @@ class Decoder:
     def read(self, *, timeout_s: float) -> DecodedPicture | None:
         """Wait for the next picture; None at the end.
 
-        Raises DecodingError if none comes for `timeout_s` or the process has died, and
+        Raises LateError if none comes for `timeout_s`, DecodingError if the process has died, and
         ResizedError if the next picture has another size.
         """
         with self._reading:
@@ -150,14 +154,14 @@ class Decoder:
                 self._process.stdin.write(bytes([self._unused.get()]))
 
     def _receive(self, deadline_s: float) -> dict[str, Any] | None:
-        """The child's next message; None if it has ended. Raises DecodingError if too late."""
+        """The child's next message; None if it has ended. Raises LateError."""
         assert self._process.stdout is not None
         while b"\n" not in self._received:
             if self._process.stdout.closed:
                 return None
             timeout_s = max(0.0, deadline_s - time.monotonic())
             if not select.select([self._process.stdout], [], [], timeout_s)[0]:
-                raise DecodingError("no picture came for too long")
+                raise LateError("no picture came for too long")
             data = os.read(self._process.stdout.fileno(), 1 << 16)
             if not data:
                 return None

@@ -13,7 +13,13 @@ from jaxtyping import UInt8
 from stream_dmr.errors import SourceError
 from stream_dmr.files import open_file
 from stream_dmr.messages import Frame
-from stream_dmr.sources.decoder import DecodedPicture, DecodingError, ResizedError, open_decoder
+from stream_dmr.sources.decoder import (
+    DecodedPicture,
+    DecodingError,
+    LateError,
+    ResizedError,
+    open_decoder,
+)
 from stream_dmr.sources.source import ReadFramesSettings, Source, nominal_ns, size_error
 
 # OpenCV passes on whatever a damaged container or a stream claims; outside of these it is no claim.
@@ -42,6 +48,12 @@ class VideoFile(Source):
         self._decoder = open_decoder(path)
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
+        except LateError:
+            self._decoder.close()
+            raise SourceError(
+                f"{path}: expected a picture within [read_frames] silence_s = {self._timeout_s:g} "
+                "s, got none; give a longer wait, or check the file"
+            ) from None
         except DecodingError:
             self._first = None
         if self._first is None:

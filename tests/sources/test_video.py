@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stream_dmr.errors import SourceError
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings, nominal_ns
@@ -159,6 +160,8 @@ def test_refuses_what_is_no_video(tmp_path, capfd):
     assert "audio file" in refusal(tmp_path / "sound.wav")
     assert "(moov)" in refusal(tmp_path / "huge.mp4")
     assert "(moov)" in refusal(cut(tmp_path / "whole.mp4"))
+    with pytest.raises(SourceError, match="silence_s = 0 s"):  # no wait is as short
+        open_source(str(tmp_path / "whole.mp4"), SETTINGS.model_copy(update={"silence_s": 0.0}))
     assert "no such file" in refusal(tmp_path / "missing.mp4")
     assert capfd.readouterr() == ("", "")  # neither OpenCV nor FFmpeg speaks
 
