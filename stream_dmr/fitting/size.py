@@ -184,5 +184,6 @@ def nats_against(problem: Problem, pose: Float[np.ndarray, "P"], *, nat: float) 
     here = evaluate(problem, pose, False)
     loss = float(here.terms @ problem.lambdas) + prior_loss(problem, pose)
     H, _ = normal_equations(problem, pose, here.rendering)
-    log_volume = 0.5 * float(np.linalg.slogdet(H / nat + 1e-9 * np.eye(len(H)))[1])
+    with np.errstate(invalid="ignore"):  # of a pose in which something overflows it is NaN
+        log_volume = 0.5 * float(np.linalg.slogdet(H / nat + 1e-9 * np.eye(len(H)))[1])
     return loss / nat + LOG_VOLUME_WEIGHT * log_volume

@@ -46,3 +46,12 @@ def test_evidence_is_the_same_for_the_same_pose():
     once, again = (nats_against(problem, found.parameters, nat=SETTINGS.nat) for _ in range(2))
     assert once == again
     assert np.isfinite(once)
+
+
+def test_a_pose_in_which_something_overflows_has_no_evidence_and_no_warning(recwarn):
+    [sample] = fish_of(broader(0.0), track_id=1, num_frames=1).samples
+    problem, found = fitted(0.0, sample)
+    pose = found.parameters.copy()
+    pose[-6] = 800.0
+    assert np.isnan(nats_against(problem, pose, nat=SETTINGS.nat))
+    assert not recwarn.list
