@@ -21,6 +21,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.reading import Recording, files_of, open_recordings
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import TOPICS, MessageTypes, Topics
+from stream_dmr.store.batch_folder import VIDEO_FOLDERS, VIDEOS
 from stream_dmr.store.fish import database_of, read_runs
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
@@ -34,6 +35,11 @@ def open_results(path: Path, *, template: str = AUTO) -> Recording:
     `template`: the run's, if known. Raises RecordingError if there is neither a recording nor a
     lengths.db.
     """
+    if (path / VIDEOS).is_file() and not _has_recording(path):
+        raise RecordingError(
+            f"{path}: expected a recording or the --out of one run, got that of a batch; give one "
+            f"of its {VIDEO_FOLDERS}/NAME, or read the fish of all in dataset/fish"
+        )
     database = database_of(path)
     if database is None or _has_recording(path):
         return open_recordings([path], of_all_runs=True)

@@ -215,6 +215,14 @@ def test_pandas_opens_the_data_set(finished: Path):
     assert list(of_first.round(6)) == [float(line["length_mm"]) for line in lengths]
 
 
+def test_an_export_of_a_batch_is_refused_with_the_folders_that_it_can_take(
+    finished: Path, tmp_path: Path
+):
+    refused = invoke(f"export {finished} --fish csv --out {tmp_path / 'exports'}")
+    assert refused.code == 2
+    assert "got that of a batch; give one of its videos/NAME" in refused.error
+
+
 def test_verify_finds_a_changed_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
