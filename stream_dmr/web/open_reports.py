@@ -1,5 +1,6 @@
 """Open the results of a run or a batch for a report, and write its page."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -88,14 +89,22 @@ def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLooku
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
-    """The folders of runs; for a batch the folders of its finished videos."""
+    """The folders of runs; for a batch the folders of its finished videos.
+
+    Raises UserError if a batch has none, or if one comes twice: its fish would count twice.
+    """
     found = list[Path]()
     for folder in folders:
         if _is_batch(folder):
-            done = (row["name"] for row in read_videos(folder) if row["status"] == DONE)
+            done = [row["name"] for row in read_videos(folder) if row["status"] == DONE]
+            if not done:
+                raise UserError(f"{folder / VIDEOS}: expected videos that are done, got none")
             found += [folder / VIDEO_FOLDERS / name for name in done]
         else:
             found.append(folder)
+    [(again, times)] = Counter(path.resolve() for path in found).most_common(1)
+    if times > 1:
+        raise UserError(f"{again}: expected each folder once, got it {times} times; give it once")
     return found
 
 
@@ -115,16 +124,14 @@ def open_folders(
     Raises UserError, also if their templates differ, since a page has a single template.
     """
     reports, failed = list[RunReport](), list[str]()
+    run_folders(folders)  # refuses what comes twice
     for folder in folders:
-        done = run_folders([folder])
-        if not done:
-            raise UserError(f"{folder / VIDEOS}: expected videos that are done, got none")
         if source is not None and (_is_batch(folder) or len(folders) > 1):
             raise UserError(
                 f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos "
                 "have their own"
             )
-        for run in done:
+        for run in run_folders([folder]):
             report = open_report(run, source=source, config=config, as_measured=as_measured)
             reports.append(report)
         rows = read_videos(folder) if _is_batch(folder) else []

@@ -77,6 +77,8 @@ class ReviewQueue:
         """
         submitted = parse_verdict(content)
         is_undo = submitted.kind == "undo"
+        if is_undo:  # another review of the same name may have written, or undone, meanwhile
+            self._last = [recorder.last() for recorder in self._recorders]
         run, undone = self._undo() if is_undo else (submitted.run, "")
         recorder = self._recorder(run)
         rows = self._rows(run, recorder.record(submitted))

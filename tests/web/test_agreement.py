@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.store.batch_folder import VIDEO_COLUMNS, VIDEOS
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.web.agreement import agreements, cohens_kappa, length_agreement
@@ -104,6 +105,16 @@ def test_a_blind_reader_called_review_is_not_taken_for_the_review(out: Path):
     submit(blind, "reject", 1, reason="glove")
     decisions = {(pair.first, pair.second): pair.decisions for pair in agreements([out])}
     assert decisions["review", "review (blind)"].count == 1
+
+
+def test_folders_that_come_twice_and_batches_without_results_are_refused(out: Path, tmp_path: Path):
+    batch = tmp_path / "batch"
+    batch.mkdir()
+    (batch / VIDEOS).write_text(",".join(VIDEO_COLUMNS))
+    for command in ("review", "agreement"):
+        twice = invoke(command, {str(out): None, str(out / ".." / "out"): None})
+        assert "expected each folder once" in twice.error
+        assert "expected videos that are done" in invoke(command, {str(batch): None}).error
 
 
 def test_equal_seeds_draw_equal_fish(out: Path):

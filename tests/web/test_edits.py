@@ -248,6 +248,13 @@ def test_undo_takes_edits_back_one_by_one(queue: ReviewQueue, out: Path):
     assert verify(out)[0] == []
 
 
+def test_undo_names_what_a_second_review_of_the_same_name_has_done(queue: ReviewQueue, out: Path):
+    second = ReviewQueue([open_report(out)], reviewer="Ada")
+    submit(queue, "accept", 1)
+    said = second.record(b'{"kind": "undo", "track_id": 0}')["said"]
+    assert said == "Fish 1: accepted, taken back"
+
+
 def test_undo_of_what_others_build_on_is_refused(queue: ReviewQueue, out: Path):
     submit(queue, "split", 1, frame_index=3)
     other = ReviewQueue([open_report(out)], reviewer="Bo")
