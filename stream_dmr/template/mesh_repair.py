@@ -38,11 +38,11 @@ class RepairedMesh:
 
 
 def repair_mesh(mesh: trimesh.Trimesh, *, name: str) -> RepairedMesh:
-    """Return `mesh` itself if it is closed, otherwise one closed surface made of its parts.
+    """Return `mesh` itself if it is one closed body, otherwise one closed surface of its parts.
 
     Raises TemplateError if nothing of it can be closed, or separate bodies remain.
     """
-    if mesh.is_watertight and mesh.is_winding_consistent:
+    if mesh.is_watertight and mesh.is_winding_consistent and _num_bodies(mesh) == 1:
         if mesh.volume < 0:
             mesh.invert()
         return RepairedMesh(mesh=mesh, changes=())
@@ -81,6 +81,12 @@ def repair_mesh(mesh: trimesh.Trimesh, *, name: str) -> RepairedMesh:
     ]
     said = tuple(f"{text}: {count}" for count, text in changes if count)
     return RepairedMesh(mesh=united, changes=said or ("faces turned outwards",))
+
+
+def _num_bodies(mesh: trimesh.Trimesh) -> int:
+    """The parts of a closed mesh, which may touch, without small ones such as eyes."""
+    volumes = [abs(float(part.volume)) for part in mesh.split(only_watertight=False, repair=False)]
+    return sum(volume > _MIN_BODY_VOLUME * sum(volumes) for volume in volumes)
 
 
 def _filled(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -14,6 +14,9 @@ from stream_dmr.geometry import arc_lengths
 
 NUM_MIDLINE_POINTS = 33
 NEAR_CENTER = 0.1  # body lengths, within which the section at the center is measured
+_MAX_REACH = (
+    2.0  # of the mesh along its axis, body lengths; bills and filaments are shorter; chosen
+)
 _MAX_OUTSIDE = 0.02  # chosen: how far a keypoint or joint may lie outside the mesh, in body lengths
 
 
@@ -84,6 +87,11 @@ def canonical_template(
     even = np.linspace(0.0, at[-1], NUM_MIDLINE_POINTS)
     midline = [np.interp(even, at, coordinates) for coordinates in spine.T]
     vertices = to_canonical(np.asarray(mesh.vertices, np.float64))
+    if (reach := float(np.ptp(vertices[:, 0]))) > _MAX_REACH:
+        raise TemplateError(
+            f"template {name}: expected head and tail at the ends of the mesh, got a mesh "
+            f"{reach:.3g} times as long as they are apart; give points in the mesh's coordinates"
+        )
     if not (np.abs(vertices[:, 0]) < NEAR_CENTER).any():
         raise TemplateError(
             f"template {name}: expected vertices all along the body, got none within "

@@ -104,6 +104,7 @@ def test_sheets_alone_are_refused():
 def test_two_fish_are_refused():
     other = FISH.copy()
     other.apply_translation([0.0, 3.0, 0.0])
-    both = trimesh.util.concatenate([FISH, other, sheet(height=0.15)])
-    with pytest.raises(TemplateError, match="expected one body, got 2 that do not touch"):
-        repair_mesh(both, name="pair")
+    for also in ([sheet(height=0.15)], []):
+        both = trimesh.util.concatenate([FISH, other, *also])
+        with pytest.raises(TemplateError, match="expected one body, got 2 that do not touch"):
+            repair_mesh(both, name="pair")

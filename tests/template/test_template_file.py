@@ -142,6 +142,10 @@ class TestRefusals:
             (moved(keypoints=[[-900, 0, 0], [0, 0, 0], [0.4, 0, 0]]), "expected head on or in the"),
             (moved(keypoints=[[-0.4, 0, 0], [0, 0, 0.3], [0.4, 0, 0]]), "expected center on or in"),
             (moved(keypoints=[[-0.4, 0, 0], [0, 0, 0], [0.7, 0, 0]]), "expected tail on or in the"),
+            (
+                {name: given / 1000 for name, given in POINTS.items()},
+                "times as long as they are",
+            ),
             (moved(joints=[[0.1, 0, 0], [0.1, 0, 0]]), "two joints coincide"),
             (moved(keypoints=[[0.2, 0, 0], [0, 0, 0], [0.2, 0, 0]]), "head and tail coincide"),
             (moved(keypoints=[[-0.4, 0, 0], [0, 0, 0], [np.inf, 0, 0]]), "expected finite keyp"),
