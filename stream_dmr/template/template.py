@@ -14,9 +14,7 @@ from stream_dmr.geometry import arc_lengths
 
 NUM_MIDLINE_POINTS = 33
 NEAR_CENTER = 0.1  # body lengths, within which the section at the center is measured
-_MAX_REACH = (
-    2.0  # of the mesh along its axis, body lengths; bills and filaments are shorter; chosen
-)
+_MAX_REACH = 2.0  # body lengths, of the mesh along its axis; bills are shorter; chosen
 _MAX_OUTSIDE = 0.02  # chosen: how far a keypoint or joint may lie outside the mesh, in body lengths
 
 
