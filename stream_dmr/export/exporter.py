@@ -116,7 +116,7 @@ class Export:
         self._require_writable(needed_for="--meshes")
         meshes, count = cache(MeshRebuilder.of), 0
         for fit, fish in self._localized(FittedMesh):
-            part = part_at(self.recording, fit.frame_index)
+            part = part_at(self.recording, fit.timestamp_ns)
             shape = meshes(part).with_vertices(fit).shape
             vertices = None if shape is None else place_fit(shape, fish)[0]
             if vertices is not None:
@@ -310,7 +310,7 @@ class Export:
 
     def _template(self, fish: Fish) -> Template:
         """The template by which a fish was measured."""
-        return header_at(self.recording, fish.estimate.last_frame).template
+        return header_at(self.recording, fish.estimate.last_timestamp_ns).template
 
     @cached_property
     def _left_out(self) -> set[int]:

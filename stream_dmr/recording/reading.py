@@ -29,7 +29,7 @@ M = TypeVar("M", bound=Message)
 class Recording(Protocol):
     """An opened recording: one file, or the segments of runs that went on in one folder."""
 
-    header: RunHeader  # of the last run; `header_at` has the header of a frame
+    header: RunHeader  # of the last run; `header_at` has the header of a time
     metadata: dict[str, str]  # the software that recorded it, with versions
     is_thinned: bool  # its pictures and masks were removed to free disk space
     ends_early: bool  # a segment, or cut off by a crash: the run went on after its end
@@ -161,9 +161,9 @@ class _Segments:
 
     @cached_property
     def starts(self) -> Sequence[tuple[int, Recording]]:
-        """The first frame of each part that has frames, and the part."""
+        """The first capture time of each part that has frames, and the part."""
         firsts = ((next(messages_of(part, Frame), None), part) for part in self.parts)
-        return [(first.frame_index, part) for first, part in firsts if first is not None]
+        return [(first.timestamp_ns, part) for first, part in firsts if first is not None]
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -183,17 +183,20 @@ class _Segments:
         return chain.from_iterable(segment.video(selection) for segment in self._segments)
 
 
-def part_at(recording: Recording, frame_index: int) -> Recording:
-    """The part of a recording in which a frame is: it has one config, template and calibration."""
+def part_at(recording: Recording, timestamp_ns: int) -> Recording:
+    """The part of a recording with a frame of that time: of one config, template and calibration.
+
+    Frame numbers may begin anew with given masks; times never do.
+    """
     if not isinstance(recording, _Segments) or len(recording.parts) == 1:
         return recording
-    number = bisect_right(recording.starts, frame_index, key=lambda start: start[0])
+    number = bisect_right(recording.starts, timestamp_ns, key=lambda start: start[0])
     return recording.starts[max(number - 1, 0)][1] if recording.starts else recording
 
 
-def header_at(recording: Recording, frame_index: int) -> RunHeader:
-    """The config, template and calibration by which a frame was measured."""
-    return part_at(recording, frame_index).header
+def header_at(recording: Recording, timestamp_ns: int) -> RunHeader:
+    """The config, template and calibration by which the frame of that time was measured."""
+    return part_at(recording, timestamp_ns).header
 
 
 def require_messages(recording: Recording) -> None:

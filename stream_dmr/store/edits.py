@@ -163,9 +163,9 @@ def changed_fish(before: TrackEdits, after: TrackEdits) -> set[int]:
 Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in order
 
 
-def settings_at(recording: Recording, frame_index: int) -> SmoothLengthSettings:
-    """The settings by which a fish whose last frame this is was measured."""
-    header = header_at(recording, frame_index)
+def settings_of(recording: Recording, last: LocalizedFish) -> SmoothLengthSettings:
+    """The settings by which a fish with this last frame was measured."""
+    header = header_at(recording, last.timestamp_ns)
     return recorded_settings(header, "smooth_length", SmoothLengthSettings)
 
 
@@ -231,7 +231,7 @@ def corrected_fish(
         raise UserError(f"frame {fit.frame_index} has no fit to correct: {fit.refusal}")
     keypoints_px = np.stack([points_px[0], shape.keypoints_px[1], points_px[1]])
     moved = replace(fit, shape=replace(shape, keypoints_px=keypoints_px))
-    header = header_at(recording, fit.frame_index)
+    header = header_at(recording, fit.timestamp_ns)
     settings = recorded_settings(header, "localize", LocalizeSettings)
     fish = localize(moved, settings=settings, calibration=header.calibration)
     if fish.length_mm is None or fish.length_std_mm is None:
@@ -244,7 +244,7 @@ def corrected_fish(
 
 def corrected_length(recording: Recording, frames: Mapping[int, LocalizedFish]) -> LengthEstimate:
     """The length from the corrected frames alone, filtered as in a run."""
-    of_points = settings_at(recording, max(frames)).model_copy(
+    of_points = settings_of(recording, frames[max(frames)]).model_copy(
         update={"min_frames": 1, "max_std_ratio": math.inf}
     )
     return length_of_frames([frames[index] for index in sorted(frames)], of_points)[-1]
@@ -255,7 +255,7 @@ def edited_row(
 ) -> dict[str, Any]:
     """The row of `fish` that a run would have written for these frames."""
     ious = [fish.iou for fish in frames if fish.accepted and fish.iou is not None]
-    settings = settings_at(recording, frames[-1].frame_index)
+    settings = settings_of(recording, frames[-1])
     estimate = length_of_frames(frames, settings)[-1]
     return fish_row(estimate, flags) | {"iou": median(ious) if ious else None}
 
@@ -306,7 +306,7 @@ class ReviewedMessages:
                 frames[message.track_id].append(message)
         running = dict[int, dict[int, LengthEstimate]]()
         for fish, of_fish in frames.items():
-            settings = settings_at(self._recording, of_fish[-1].frame_index)
+            settings = settings_of(self._recording, of_fish[-1])
             estimates = length_of_frames(of_fish, settings)[:-1]
             running[fish] = {each.frame_index: each for each in estimates}
         return running

@@ -194,7 +194,7 @@ class TrackEditor:
         self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
     ) -> TrackEdit:
         """Measure a missed fish in the drawn boxes; `time_ns`: times of the first and last box."""
-        new_fish, part = self._new_fish(), part_at(report.recording, min(drawn))
+        new_fish, part = self._new_fish(), part_at(report.recording, time_ns[0])
         frames, fish, is_original = measure_boxes(
             list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
             drawn,

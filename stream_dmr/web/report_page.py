@@ -259,7 +259,7 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: its row of fish.csv, and a thumbnail of its best view."""
-    template = header_at(report.recording, fish.estimate.last_frame).template
+    template = header_at(report.recording, fish.estimate.last_timestamp_ns).template
     record = fish_record(fish, template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}

@@ -269,7 +269,7 @@ def draw_views(
     without = ((frame_index, None) for frame_index in list(waiting))
     for frame_index, image in chain(images, without):  # the first image of a frame is drawn
         for track_id, view in waiting.pop(frame_index, []):
-            part = part_at(recording, frame_index)
+            part = part_at(recording, view.row.fish.timestamp_ns)
             drawn = _draw_view(view, meshes(part), part.header.template, image)
             if not np.array_equal(part.header.template.faces, recording.header.template.faces):
                 drawn = replace(drawn, vertices=None)  # the page has the last template's faces
