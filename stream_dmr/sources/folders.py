@@ -164,7 +164,7 @@ def _not_read(names: list[str]) -> str:
 
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
-_MAX_EARLY_S = 3600.0  # of a clip, before what was measured; copies have the times of their making
+_MAX_EARLY_S = 3600.0  # of a clip's end, before the latest; chosen
 _SETTLE_S = 5.0  # a clip that has not grown for so long is complete, or never will be; chosen
 _PAUSE_CLIPS = 2.0  # clips' durations without a new clip after which its fish are gone; chosen
 _POLL_S = 0.5
@@ -204,6 +204,7 @@ class ClipFolder(Source):
         self._read: dict[str, _FileState] = {}  # the clips when their reading began
         self._rewritten: set[str] = set()  # names of clips that others replaced since
         self._after_ns = 0
+        self._latest_ns = 0  # the latest end of a clip, by its file
         self._is_early = False  # the last clip came late, or after a wrong time
         self._on_pause: Callable[[], None] = lambda: None
         self._clip_s = 0.0  # duration of the last clip
@@ -219,7 +220,8 @@ class ClipFolder(Source):
     def resume(self, point: ResumePoint) -> None:
         """Skip the clips and frames that were done, and begin after the last capture time."""
         self._begun.update(point.clips_done)
-        self._frames_done, self._after_ns = {**point.frames_done}, point.after_ns
+        self._frames_done = {**point.frames_done}
+        self._after_ns = self._latest_ns = point.after_ns
 
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
@@ -241,8 +243,8 @@ class ClipFolder(Source):
             for frame in self._whole_frames(self._video):
                 frame_index += 1
                 if frame.frame_index == done + 1:  # frames read before may lie before the last time
-                    early_s = (next_ns - frame.timestamp_ns - start_ns) / 1e9
-                    self._note_early(path.name, early_s)
+                    if state is not None:
+                        self._note_early(path.name, state.modified_ns)
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
                 last_ns = max(last_ns, start_ns + frame.timestamp_ns)
                 if frame.frame_index > done:
@@ -303,7 +305,9 @@ class ClipFolder(Source):
             self._note_rewritten(path.name)
         return state.num_bytes > before.num_bytes
 
-    def _note_early(self, name: str, early_s: float) -> None:
+    def _note_early(self, name: str, ended_ns: int) -> None:
+        early_s = (self._latest_ns - ended_ns) / 1e9
+        self._latest_ns = max(self._latest_ns, ended_ns)
         if early_s > _MAX_EARLY_S and not self._is_early:
             self._on_notice(
                 f"{name}: by its time of change it is {early_s:.0f} s older than what was measured "

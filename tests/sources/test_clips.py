@@ -22,10 +22,17 @@ AT_ONCE = ReadFramesSettings(clips_wait_s=0.0)
 OLD_S = 1_700_000_000
 
 
-def clip(path: Path, *, first: int, num_frames: int = 4, size: tuple[int, int] = (64, 48)) -> Path:
-    """Grey pictures `first`, `first` + 1, ..., 25 a second; whole for long."""
+def clip(
+    path: Path,
+    *,
+    first: int,
+    num_frames: int = 4,
+    size: tuple[int, int] = (64, 48),
+    fps: float = 25.0,
+) -> Path:
+    """Grey pictures `first`, `first` + 1, ..., `fps` a second; whole for long."""
     draft = path.with_suffix(".draft.avi")
-    writer = cv2.VideoWriter(str(draft), cv2.VideoWriter_fourcc(*"FFV1"), 25.0, size)
+    writer = cv2.VideoWriter(str(draft), cv2.VideoWriter_fourcc(*"FFV1"), fps, size)
     for k in range(first, first + num_frames):
         writer.write(np.full((size[1], size[0], 3), 8 * k, np.uint8))
     writer.release()
@@ -70,6 +77,15 @@ def test_clips_after_one_with_a_wrong_time_are_said_once(tmp_path: Path):
     assert all(a < b for a, b in itertools.pairwise(times))
     (warning,) = folder.warnings
     assert warning.startswith("3.avi: by its time of change it is 99999997 s older")
+
+
+def test_copies_of_long_clips_are_not_early(tmp_path: Path):
+    """They have the times of their making: each ends seconds after the one before."""
+    for number in (1, 2, 3):
+        clip(tmp_path / f"{number}.avi", first=number, num_frames=25, fps=0.005)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    assert len(list(folder)) == 75
+    assert folder.warnings == []
 
 
 def test_a_clip_that_can_not_be_used_is_left_out(tmp_path: Path):
