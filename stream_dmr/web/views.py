@@ -106,7 +106,7 @@ def draw_outlines(
 def frame_images(
     recording: Recording, wanted: set[int], source: str | None, *, is_given: bool
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """The images of the wanted frames, from `source`, or without it from the recording.
+    """The images of the frames of the wanted times, from `source`, or without it as recorded.
 
     If `source` is not the recorded source, SourceError is raised if the user gave it (`is_given`);
     else its frames are left out.
@@ -119,11 +119,11 @@ def frame_images(
         opened = open_pictures(source, settings)
     with checked, opened as pictures:
         for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
-            if message.frame_index in wanted and isinstance(message, Frame):
+            if message.timestamp_ns in wanted and isinstance(message, Frame):
                 with checked:
                     frame = pictures.restore(message, payload)
                     if frame.image.size:
-                        yield frame.frame_index, frame.image
+                        yield frame.timestamp_ns, frame.image
 
 
 def recorded_source(recording: Recording) -> str | None:
@@ -257,19 +257,18 @@ def draw_views(
     waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:
-            waiting[view.row.fish.frame_index].append((track_id, view))
+            waiting[view.row.fish.timestamp_ns].append((track_id, view))
     drawn_views: defaultdict[int, list[DrawnView]] = defaultdict(list)
     if pictures is None:
         video = source or recorded_source(recording)
         images = frame_images(recording, set(waiting), video, is_given=source is not None)
     else:
-        times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
-        found = (shown.frame for t in sorted(times) for shown in pictures.frames((t, t + 1)))
-        images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
-    without = ((frame_index, None) for frame_index in list(waiting))
-    for frame_index, image in chain(images, without):  # the first image of a frame is drawn
-        for track_id, view in waiting.pop(frame_index, []):
-            part = part_at(recording, view.row.fish.timestamp_ns)
+        found = (shown.frame for t in sorted(waiting) for shown in pictures.frames((t, t + 1)))
+        images = ((frame.timestamp_ns, frame.image) for frame in found if frame.image.size)
+    without = ((timestamp_ns, None) for timestamp_ns in list(waiting))
+    for timestamp_ns, image in chain(images, without):  # the first image of a frame is drawn
+        for track_id, view in waiting.pop(timestamp_ns, []):
+            part = part_at(recording, timestamp_ns)
             drawn = _draw_view(view, meshes(part), part.header.template, image)
             if not np.array_equal(part.header.template.faces, recording.header.template.faces):
                 drawn = replace(drawn, vertices=None)  # the page has the last template's faces

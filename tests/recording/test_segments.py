@@ -466,11 +466,11 @@ def test_a_table_of_frames_that_was_put_in_is_not_signed(interrupted: Path, tmp_
 
 def test_every_frame_of_clips_is_found_again_over_a_restart(interrupted: Path):
     recording = open_recordings([interrupted])
-    frames = {m.frame_index for m in read_messages(interrupted, [Frame])}
+    times = {m.timestamp_ns for m in read_messages(interrupted, [Frame])}
     source = recorded_source(recording)
     assert source == str(interrupted.parent / "clips")
-    found = [index for index, _ in frame_images(recording, frames, source, is_given=True)]
-    assert sorted(set(found)) == sorted(frames)
+    found = [time_ns for time_ns, _ in frame_images(recording, times, source, is_given=True)]
+    assert sorted(set(found)) == sorted(times)
 
 
 def test_a_report_takes_a_folder_of_clips(interrupted: Path, tmp_path: Path):

@@ -70,9 +70,9 @@ def clips_of(folder: Path) -> dict[str, str]:
     return options | {"--source": str(folder / "clips")}
 
 
-def add_clip(folder: Path, name: str) -> None:
+def add_clip(folder: Path, name: str, *, video: str = "video.mp4") -> None:
     clip = folder / "clips" / name
-    shutil.copy(folder / "video.mp4", clip)
+    shutil.copy(folder / video, clip)
     os.utime(clip, (1_700_000_000, 1_700_000_000))  # long ago, so that it is complete
 
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -20,7 +21,16 @@ from stream_dmr.store.fish import read_measured_fish, read_stored_fish
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.review_queue import ReviewQueue
 from tests.support.command import invoke
-from tests.support.tiny_clip import add_clip, calibration, clips_of, write_template
+from tests.support.tiny_clip import (
+    HEIGHT,
+    WIDTH,
+    add_clip,
+    calibration,
+    clips_of,
+    draw_mask,
+    draw_picture,
+    write_template,
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +38,19 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fish 1 and 2 in frames 1 to 6; fish 3 and 4, the same, by the second run in frames 4 to 6.
 
     With given masks, the second run numbers its frames anew, after those of the clip in which the
-    first ended.
+    first ended. Its pictures are a quarter as bright.
     """
     clip = tmp_path_factory.mktemp("changed") / "clip"
     options = clips_of(clip)
     add_clip(clip, "2.mp4")
     assert invoke("run", options).code == 0
-    add_clip(clip, "3.mp4")
+    dark = cv2.VideoWriter(
+        str(clip / "dark.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (WIDTH, HEIGHT)
+    )
+    for index in (1, 2, 3):
+        dark.write(draw_picture(draw_mask(index, [1, 2])) // 4)
+    dark.release()
+    add_clip(clip, "3.mp4", video="dark.mp4")
     with (clip / "quick.toml").open("a") as config:
         config.write("\n[smooth_length]\nmin_frame_std_ratio = 0.1\n\n[watch]\nport = 8099\n")
     plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, 4000.0]))
@@ -55,6 +71,11 @@ def test_each_fish_is_shown_and_exported_by_its_own_inputs(changed: Path, tmp_pa
     assert by_fish[3] == pytest.approx(2 * by_fish[1], rel=0.1)
     report = open_report(changed)
     assert {caught.estimate.track_id for caught in report.fish} == set(report.views) == {1, 2, 3, 4}
+    first, second = (
+        cv2.imdecode(np.frombuffer(report.views[fish][0].picture, np.uint8), 1).mean()
+        for fish in (1, 3)
+    )
+    assert second < 0.5 * first
     assert write_report([report], tmp_path / "report.html", title="changed") > 0
     Export(changed).meshes(tmp_path, format="ply")
     spans = {
