@@ -32,9 +32,14 @@ from stream_dmr.evidence.seal import (
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.verify_batch import check_batch
 from stream_dmr.files import is_locked, sha256_of
-from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish, track_of
+from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, track_of
 from stream_dmr.recording.mcap.mcap_recording import is_torn
-from stream_dmr.recording.reading import decoded_messages, open_recordings
+from stream_dmr.recording.reading import (
+    Recording,
+    decoded_messages,
+    messages_of,
+    open_recordings,
+)
 from stream_dmr.recording.repair import DAMAGED
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.batch_folder import VIDEOS
@@ -131,6 +136,7 @@ def _corrections(
         for fit in ReviewedMessages(recording, database, fish).of(FittedMesh)
         if (fit.track_id, fit.frame_index) in wanted
     }
+    first_ns, is_of_camera = _first_ns(recording), any(database.parent.glob("recording-*"))
     for number, verdict in corrections:
         said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
         of_reader = blind_readings(said).get(verdict.reviewer, [])
@@ -139,7 +145,8 @@ def _corrections(
         review = reviews_of(of_fish).get(verdict.track_id, NOT_REVIEWED)
         moved = {**review.moved, **verdict.moved}
         missing = [frame for frame in moved if (verdict.track_id, frame) not in fits]
-        if missing and any(database.parent.glob("recording-*")):
+        times = [fits[verdict.track_id, frame].timestamp_ns for frame in moved.keys() - {*missing}]
+        if is_of_camera and (missing or min(times, default=first_ns) < first_ns):
             continue  # as in `_lengths`
         if missing or not verdict.moved:
             yield f"{name} is corrected to {verdict.length_mm} mm by no points in its frames"
@@ -166,18 +173,28 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
     recording = open_recordings([database.parent], of_all_runs=True)
     tracks = {part.track_id for fish in edits.fish.values() for part in fish.parts}
     frames = frames_of_tracks(recording, database, tracks, last_frames)
+    first_ns, is_of_camera = _first_ns(recording), any(database.parent.glob("recording-*"))
     for track_id, edited in edits.fish.items():
         try:
             chosen = frames_of_parts(frames, edited.parts, fish=track_id)
         except UserError:
             yield f"fish {track_id}: its tracks are in view together"
             continue
-        if len(chosen) < edited.row["frames_seen"] and any(database.parent.glob("recording-*")):
-            continue  # the oldest segments of a camera are deleted if room is short
+        # The oldest segments of a camera are deleted if room is short: with frames, and with the
+        # settings of fish that reviewers added there, whose frames are in the database.
+        is_whole = len(chosen) >= edited.row["frames_seen"]
+        if is_of_camera and not (is_whole and chosen and chosen[-1].timestamp_ns >= first_ns):
+            continue
         expected = edited_row(recording, chosen, ()) if chosen else {}
         for name, now in edited.row.items():
             if name not in _NOT_COMPUTED and now != expected.get(name):
                 yield f"fish {track_id}: {name} is {now}, its frames give {expected.get(name)}"
+
+
+def _first_ns(recording: Recording) -> int:
+    """The time of the first frame that a recording still has; 0 without any."""
+    first = next(messages_of(recording, Frame), None)
+    return 0 if first is None else first.timestamp_ns
 
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")

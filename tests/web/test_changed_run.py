@@ -1,6 +1,7 @@
 """A run that went on in its folder with another config, calibration and template."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,6 +114,24 @@ def test_a_reviewer_works_by_the_inputs_of_the_fish(changed: Path, fish: int):
     )
     assert stored[fish + 1].length_std_mm == measured[fish + 1].length_std_mm
     assert verify(changed)[0] == []
+
+
+def test_verify_asks_no_length_of_an_added_fish_whose_settings_were_deleted(
+    changed: Path, tmp_path: Path
+):
+    """As the oldest segments are if room is short; the frames of added fish are in lengths.db."""
+    out = Path(shutil.copytree(changed, tmp_path / "out"))
+    report = open_report(out)
+    box = {"x0": 8.0, "y0": 18.0, "x1": 52.0, "y1": 104.0}
+    seen = {row.fish.frame_index: row.fish.timestamp_ns for row in report.tracks[1].rows}
+    drawn = [box | {"frame_index": index, "timestamp_ns": str(seen[index])} for index in (1, 5)]
+    said = {"kind": "add", "boxes": drawn, "sure": True}
+    (row,) = ReviewQueue([report], reviewer="Ada").record(json.dumps(said).encode())["rows"]
+    assert row["length_mm"] is not None
+    assert verify(out)[0] == []
+    for segment in out.glob("recording-000001.*"):
+        segment.unlink()
+    assert verify(out)[0] == []
 
 
 def test_a_replay_of_two_configs_is_refused_and_each_part_can_be_replayed(
