@@ -61,6 +61,7 @@ class RecordedRun:
     paths: Sequence[Path]
     kinds: Collection[type[Message]]
     selection: Selection
+    # Of the last run, where one went on in its folder with others.
     calibration: Calibration | None  # None: there are no millimetres
     template: Template
     config_toml: str  # every setting of the run

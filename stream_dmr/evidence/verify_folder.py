@@ -136,7 +136,7 @@ def _corrections(
         for fit in ReviewedMessages(recording, database, fish).of(FittedMesh)
         if (fit.track_id, fit.frame_index) in wanted
     }
-    first_ns, is_of_camera = _first_ns(recording), any(database.parent.glob("recording-*"))
+    first_ns = _first_left_ns(database, recording)
     for number, verdict in corrections:
         said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
         of_reader = blind_readings(said).get(verdict.reviewer, [])
@@ -146,7 +146,7 @@ def _corrections(
         moved = {**review.moved, **verdict.moved}
         missing = [frame for frame in moved if (verdict.track_id, frame) not in fits]
         times = [fits[verdict.track_id, frame].timestamp_ns for frame in moved.keys() - {*missing}]
-        if is_of_camera and (missing or min(times, default=first_ns) < first_ns):
+        if first_ns is not None and (missing or min(times, default=first_ns) < first_ns):
             continue  # as in `_lengths`
         if missing or not verdict.moved:
             yield f"{name} is corrected to {verdict.length_mm} mm by no points in its frames"
@@ -173,17 +173,17 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
     recording = open_recordings([database.parent], of_all_runs=True)
     tracks = {part.track_id for fish in edits.fish.values() for part in fish.parts}
     frames = frames_of_tracks(recording, database, tracks, last_frames)
-    first_ns, is_of_camera = _first_ns(recording), any(database.parent.glob("recording-*"))
+    first_ns = _first_left_ns(database, recording)
     for track_id, edited in edits.fish.items():
         try:
             chosen = frames_of_parts(frames, edited.parts, fish=track_id)
         except UserError:
             yield f"fish {track_id}: its tracks are in view together"
             continue
-        # The oldest segments of a camera are deleted if room is short: with frames, and with the
-        # settings of fish that reviewers added there, whose frames are in the database.
         is_whole = len(chosen) >= edited.row["frames_seen"]
-        if is_of_camera and not (is_whole and chosen and chosen[-1].timestamp_ns >= first_ns):
+        if first_ns is not None and not (
+            is_whole and chosen and chosen[-1].timestamp_ns >= first_ns
+        ):
             continue
         expected = edited_row(recording, chosen, ()) if chosen else {}
         for name, now in edited.row.items():
@@ -191,8 +191,14 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
                 yield f"fish {track_id}: {name} is {now}, its frames give {expected.get(name)}"
 
 
-def _first_ns(recording: Recording) -> int:
-    """The time of the first frame that a recording still has; 0 without any."""
+def _first_left_ns(database: Path, recording: Recording) -> int | None:
+    """The time of the first frame that the segments of a camera still have; None for a video.
+
+    Where room is short the oldest are deleted: with frames, and with the settings of fish that
+    reviewers added there, whose frames are in the database.
+    """
+    if not any(database.parent.glob("recording-*")):
+        return None
     first = next(messages_of(recording, Frame), None)
     return 0 if first is None else first.timestamp_ns
 

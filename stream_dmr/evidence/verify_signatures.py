@@ -10,7 +10,7 @@ from typing import NamedTuple
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from stream_dmr.errors import OutputError
-from stream_dmr.evidence.seal import CONTINUED, RECORDINGS
+from stream_dmr.evidence.seal import CONTINUED
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.verify_folder import Row, guarded, utc
 from stream_dmr.files import is_locked, sha256_of
@@ -260,8 +260,7 @@ def _files(signed: _Signed) -> Iterator[str]:
 
 def _recordings(folder: Path) -> set[Path]:
     """What other commands take for recordings: views alone only where there is no .mcap."""
-    found = {path for pattern in RECORDINGS for path in folder.glob(pattern)}
-    return {path for path in found if path.suffix != ".rrd"} or found
+    return {*folder.glob("*.mcap")} or {*folder.glob("*.rrd")}
 
 
 def _noted_files(signed: _Signed) -> Iterator[str]:

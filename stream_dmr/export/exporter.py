@@ -212,11 +212,9 @@ class Export:
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        settings = config.fisheries
+        settings, notes = config.fisheries, species_notes(config, self.header.template)
         records = [fish_record(fish, self._template(fish), settings, checks) for fish in self._fish]
-        self.notes += species_notes(config, self.header.template) or unweighed_note(
-            records, settings
-        )
+        self.notes += notes or unweighed_note(records, settings)
         with self._writing(path):
             if format == "csv":
                 write_csv(path, FISH_TABLE if all_columns else used_columns(records), records)

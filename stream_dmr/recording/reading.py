@@ -82,8 +82,9 @@ def open_recordings(paths: Sequence[Path], *, of_all_runs: bool = False) -> Reco
 
 def _require_one_header(files: Sequence[Path], segments: Sequence[Recording]) -> None:
     for (before, first), (file, second) in pairwise(zip(files, segments, strict=True)):
-        one, other = first.header.attachments(), second.header.attachments()
-        if differ := {name for name in one | other if one.get(name) != other.get(name)}:
+        if first.header.checksum != second.header.checksum:
+            one, other = first.header.attachments(), second.header.attachments()
+            differ = {name for name in one | other if one.get(name) != other.get(name)}
             raise RecordingError(
                 f"{file}: expected the {', '.join(sorted(differ))} of {before}, got another: a run "
                 "went on with it; give the recordings before this one and those from it on apart"

@@ -294,7 +294,7 @@ class ClipFolder(Source):
         return video
 
     def _has_more(self, path: Path) -> bool:
-        """True for a clip that was not read, or has grown since."""
+        """True for a clip that was not read, or has grown since; names one that was replaced."""
         if path.name not in self._begun:
             return True
         state, before = _state_of(path), self._read.get(path.name)

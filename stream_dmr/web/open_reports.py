@@ -123,19 +123,17 @@ def open_folders(
 
     Raises UserError, also if their templates differ, since a page has a single template.
     """
-    reports, failed = list[RunReport](), list[str]()
-    run_folders(folders)  # refuses what comes twice
-    for folder in folders:
-        if source is not None and (_is_batch(folder) or len(folders) > 1):
-            raise UserError(
-                f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos "
-                "have their own"
-            )
-        for run in run_folders([folder]):
-            report = open_report(run, source=source, config=config, as_measured=as_measured)
-            reports.append(report)
-        rows = read_videos(folder) if _is_batch(folder) else []
-        failed += [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
+    runs, batches = run_folders(folders), [*filter(_is_batch, folders)]
+    if source is not None and (batches or len(folders) > 1):
+        raise UserError(
+            f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos have "
+            "their own"
+        )
+    reports = [
+        open_report(run, source=source, config=config, as_measured=as_measured) for run in runs
+    ]
+    rows = [row for batch in batches for row in read_videos(batch)]
+    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     names = {report.recording.header.template.name for report in reports}
     if len(names) > 1:
         raise UserError(

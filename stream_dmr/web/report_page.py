@@ -208,7 +208,10 @@ def render_page(
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
-    """A line for each stock that a run learnt, with its difference from its body form."""
+    """A line for each stock that a run learnt, with its difference from its body form.
+
+    Of the last run, where one went on in its folder.
+    """
     shapes = known_shapes(part_at(report.recording, sys.maxsize))
     stocks = None if shapes is None else shapes.stocks()
     if stocks is None:
