@@ -14,8 +14,8 @@ from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.pipeline.config import HaulsSettings
 from stream_dmr.sources.sensors_settings import utc_ns_of
 from stream_dmr.store.fish import database_of, read_runs
-from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import HAULS, WATCHED, add_row, read_rows
+from stream_dmr.store.length_store import MARK_EVERY_NS, LengthStore
+from stream_dmr.store.schema import CLIPS, HAULS, MARKS, WATCHED, add_row, read_rows
 from stream_dmr.store.trip import END, START, Haul, haul_at, haul_values, hauls_of, next_name
 
 _RULE = "rule"
@@ -117,9 +117,12 @@ class HaulLog:
             if not estimate.is_final:
                 return
             if self._pause_ns and self._ruled is None and self.current() is None:
-                self._ruled = next_name(self.hauls())
-                # From the first frame of any fish in view: it may have come before this fish.
-                self._add(START, self._ruled, min(self._in_view.values()), _RULE)
+                self._ruled = next_name(self._known)
+                # From the first frame of any fish in view: it may have come before this fish. But
+                # a haul that people ended meanwhile keeps its end.
+                ends = [haul.ended_ns or 0 for haul in self._known]
+                past = [end_ns for end_ns in ends if end_ns <= self._now_ns]
+                self._add(START, self._ruled, max([min(self._in_view.values()), *past]), _RULE)
             del self._in_view[estimate.track_id]
 
     def take_position(self, position: Position) -> None:
@@ -207,10 +210,21 @@ def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
             f"{folder}: its run does not know the time of day of its frames; give --at in seconds, "
             "as in lengths.csv"
         )
+    if at is None:
+        return _now_ns(database, time.time_ns() - zero_ns)
     try:
-        return (time.time_ns() if at is None else utc_ns_of(at)) - zero_ns
+        return utc_ns_of(at) - zero_ns
     except ValueError as error:
         raise UserError(f"--at: expected {error}") from error
+
+
+def _now_ns(database: Path, wall_ns: int) -> int:
+    """Now on the clock of the frames: that of a camera goes on evenly if this machine's is set."""
+    marks = {row["name"]: row["value"] for row in read_rows(database, MARKS)}
+    last_ns = marks.get("timestamp_ns", 0)
+    if not last_ns or read_rows(database, CLIPS):  # clips may be measured long after they came
+        return wall_ns
+    return min(max(wall_ns, last_ns), last_ns + MARK_EVERY_NS)
 
 
 def _seconds(at: str | None) -> float | None:

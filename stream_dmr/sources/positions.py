@@ -101,6 +101,7 @@ _DAY_NS = 86_400_000_000_000
 _ROLL_OVER_NS = 1024 * 7 * _DAY_NS  # GPS counts weeks modulo 1024
 _RMC_EVERY_NS = 5_000_000_000  # a receiver that sends RMC at least so often needs no GGA; chosen
 _NOISE_M = 50.0  # between two positions of a vessel that lies still; chosen
+_TIME_JUMP_S = 60.0  # more than sentences are late; chosen
 _AGREEING = 3  # so many positions after a jump that agree with each other are the truth; chosen
 _EARTH_M = 6_371_008.8  # mean radius, IUGG
 _M_PER_S = 1852 / 3600  # a knot
@@ -270,7 +271,11 @@ class JumpGate:
         return True
 
     def _follows(self, before: tuple[Fix, int], now: tuple[Fix, int]) -> bool:
-        seconds = (now[1] - before[1]) / 1e9
+        seconds, utc_s = (now[1] - before[1]) / 1e9, None
+        if before[0].utc_ns is not None and now[0].utc_ns is not None:
+            utc_s = (now[0].utc_ns - before[0].utc_ns) / 1e9
+        if utc_s is not None and abs(utc_s - seconds) > _TIME_JUMP_S:  # of a receiver
+            return False
         reach_m = self._max_m_per_s * seconds + _NOISE_M
         return seconds >= 0 and distance_m(before[0], now[0]) <= reach_m
 

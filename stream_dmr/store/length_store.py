@@ -152,7 +152,7 @@ def _num_written(database: sqlite3.Connection) -> int:
     return dict(database.execute("SELECT name, value FROM marks")).get(WRITTEN, 0)
 
 
-_MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
+MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _BEGIN_ANEW = "what is measured will not be found here: end the run and begin it anew"
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
 _COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
@@ -247,7 +247,7 @@ class LengthStore:
     def frame_passed(self, *, frame_index: int, timestamp_ns: int) -> None:
         """Mark a frame: its number durably at once, its capture time within seconds."""
         self.last_ns = timestamp_ns
-        is_due = time.monotonic_ns() - self._marked_at_ns > _MARK_EVERY_NS
+        is_due = time.monotonic_ns() - self._marked_at_ns > MARK_EVERY_NS
         if is_due or frame_index > self._used.frame_index:
             self._marked_at_ns = time.monotonic_ns()
             self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
@@ -304,7 +304,7 @@ class LengthStore:
     def resume_after_ns(self) -> int:
         """The capture time after which a live source continues, for any setting of the clock."""
         mark_ns = self.before.timestamp_ns
-        return mark_ns if time.time_ns() > mark_ns else mark_ns + _MARK_EVERY_NS
+        return mark_ns if time.time_ns() > mark_ns else mark_ns + MARK_EVERY_NS
 
     @property
     def calibration_sha256(self) -> str:

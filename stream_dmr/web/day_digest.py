@@ -212,6 +212,18 @@ def _pictures(
                 yield f"pictures/{track_id}.webp", webp.tobytes()
 
 
+def measured_until(store: LengthStore, *, is_live: bool) -> Callable[[], int]:
+    """Returns the time up to which a run has measured all, ns since 1970, for its digests.
+
+    As capture times do, that of a camera goes on evenly from now, however the clock is set. Clips
+    may be measured long after they were filmed.
+    """
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    if not is_live:
+        return lambda: store.last_ns
+    return lambda: max(store.last_ns, offset_ns + time.monotonic_ns())
+
+
 @dataclass(eq=False)
 class DailyDigests:
     """Writes the digest of each day of a run when it is over, in a thread of its own.

@@ -176,14 +176,16 @@ class WatchObserver(RunObserver):
         # Closed after the digests: from STOPPING on systemd waits for TimeoutStopSec alone.
         self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         if config.digest.folder and inputs.source.is_endless:
-            from stream_dmr.web.day_digest import DailyDigests  # with the views of a report
+            from stream_dmr.web.day_digest import (  # with the views of a report
+                DailyDigests,
+                measured_until,
+            )
 
             digests = DailyDigests(
                 Path(config.digest.folder),
                 store,
                 Signer(inputs.request.key),
-                # Clips may be measured long after they were filmed.
-                time.time_ns if inputs.source.is_live else lambda: store.last_ns,
+                measured_until(store, is_live=inputs.source.is_live),
                 problems=state.problems,
                 on_notice=self.warn,
             )

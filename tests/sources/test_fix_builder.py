@@ -78,6 +78,17 @@ def test_positions_after_a_jump_count_once_they_agree():
     assert passed == [False, False, True, True, True]
 
 
+def test_a_time_that_jumps_is_left_out_of_a_receiver_too_until_others_agree():
+    made = builder(START_NS)
+    ahead_s = [0, 0, 86_400, 0, -7200, 0, *[600] * 4]
+    passed = []
+    for i, ahead in enumerate(ahead_s):
+        line = rmc(START_NS + (i + ahead) * SECOND, 57.0, -152.0).encode()
+        passed.append(made.take(line, arrival_ns=i * SECOND) is not None)
+    assert passed == [True, True, False, True, False, True, False, False, True, True]
+    assert made.counts.jumps == 4
+
+
 def test_distance_of_a_degree_along_a_meridian():
     one, other = (Fix(utc_ns=0, latitude=lat, longitude=7.0) for lat in (0.0, 1.0))
     assert abs(distance_m(one, other) - 111_195) < 1

@@ -1,5 +1,7 @@
 """Hauls: what events make of them, and the effort that counts are divided by."""
 
+import time
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -37,8 +39,8 @@ def test_hauls_never_overlap(events: list[tuple[str, int]]):
     for before, after in pairwise(hauls):
         assert before.ended_ns is not None
         assert before.began_ns <= before.ended_ns <= after.began_ns
-    for time in range(51):
-        assert sum(haul.includes(time) for haul in hauls) <= 1
+    for time_ns in range(51):
+        assert sum(haul.includes(time_ns) for haul in hauls) <= 1
 
 
 def test_a_fish_belongs_to_the_haul_of_its_middle():
@@ -179,6 +181,38 @@ def test_a_rule_does_not_end_a_haul_that_a_command_began_during_its_own(tmp_path
     assert current == log.current()
     assert current is not None
     assert current.name == "north"
+
+
+def test_a_rule_begins_no_haul_before_the_end_of_one_that_people_ended(tmp_path: Path):
+    """A fish in view at that end belongs to A or to the haul of the rule, which comes after it."""
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(pause_min=5.0))
+    for second in range(0, 200, 10):
+        log.take_frame(second * SECOND)
+        if second in (0, 60):
+            log.mark("start" if second == 0 else "end", "A", said_by="Ada")
+        if second in (70, 100):  # the first was in view from 50 to 52 s
+            log.take_fish(
+                fish(second, first_timestamp_ns=50 * SECOND, last_timestamp_ns=70 * SECOND)
+            )
+        log.frame_done()
+    first, second = log.hauls()
+    store.close()
+    assert (first.name, first.ended_ns) == ("A", 60 * SECOND)
+    assert (second.name, second.began_ns, second.ended_ns) == ("1", 60 * SECOND, None)
+
+
+def test_a_command_without_a_time_means_the_frames_that_come_now(tmp_path: Path):
+    """Whatever the clock was set to after a camera's run began."""
+    times = [time.time_ns() + hours * 3600 * SECOND for hours in (-2, 0, 2)]
+    for began_ns in times:
+        folder = tmp_path / str(began_ns)
+        folder.mkdir()
+        with closing(LengthStore(folder, replace(FACTS, utc_zero_ns=0))) as store:
+            store.frame_passed(frame_index=1, timestamp_ns=began_ns)
+            write_haul(folder, "start", name="7", at=None, said_by="Ada")
+        (haul,) = hauls_of(read_rows(folder / NAME, HAULS))
+        assert 0 <= haul.began_ns - began_ns <= 5 * SECOND
 
 
 def test_a_rule_waits_for_the_fish_of_frames_before_a_pause(tmp_path: Path):

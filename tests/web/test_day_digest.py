@@ -42,7 +42,13 @@ from stream_dmr.store.trip import (
     thinned,
 )
 from stream_dmr.web import day_digest
-from stream_dmr.web.day_digest import MAX_BYTES, DailyDigests, grouped_sums, write_digest
+from stream_dmr.web.day_digest import (
+    MAX_BYTES,
+    DailyDigests,
+    grouped_sums,
+    measured_until,
+    write_digest,
+)
 from stream_dmr.web.fleet_page import BoxState, ask_all, load_boxes
 from stream_dmr.web.watch_observer import WatchObserver
 from tests.support.command import invoke
@@ -406,6 +412,24 @@ def test_a_fish_that_comes_later_is_not_lost(tmp_path: Path, folder: Path):
             assert list(taken(folder)) == [str(DAY)]
         box.write_due(noon(DAY) + 2 * DAY_NS)
         assert list(taken(folder)) == []
+
+
+def test_a_clock_that_is_set_ends_no_day(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """It was written again with each fish, since capture times go on from those before."""
+    with closing(LengthStore(tmp_path, BOX)) as store:
+        until = measured_until(store, is_live=True)
+        live(store, datetime.now(UTC).date(), range(1, 3))
+        began_ns = time.time_ns()
+        monkeypatch.setattr(time, "time_ns", lambda: began_ns + 3 * DAY_NS)
+        others = {"problems": tuple, "on_notice": pytest.fail}
+        with closing(DailyDigests(folder, store, Signer(None), until, **others)) as digests:
+            digests.write_due()
+            assert not folder.exists()
+            store.frame_passed(frame_index=1, timestamp_ns=time.time_ns())  # as the day ends
+            digests.write_due()
+            assert len(list(folder.iterdir())) == 1
 
 
 def test_what_the_disk_refuses_is_tried_again(
