@@ -13,6 +13,7 @@ import cv2
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
+from stream_dmr.files import FolderLock
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.messages import Frame, LengthEstimate, Message, Position
@@ -25,7 +26,12 @@ from stream_dmr.pipeline.learn_shapes import (
     with_learnt_shapes,
 )
 from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
-from stream_dmr.pipeline.run_folder import prepare_folder, result_names
+from stream_dmr.pipeline.run_folder import (
+    AGAIN,
+    prepare_folder,
+    remove_unfinished,
+    result_names,
+)
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
 from stream_dmr.pipeline.run_options import RunOptions
@@ -209,6 +215,7 @@ def measure_source(
     with `--template auto`, and the new results replace the first results.
     """
     observer = observer or RunObserver()
+    remove_unfinished(request.out)
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
     cv2.setNumThreads(1)
     summary, mesh_fits = _measure(request, stop=stop, observer=observer)
@@ -225,9 +232,13 @@ def _measured_again(
     out = request.out
     # The learnt mesh must not replace a mesh of the user's.
     require_free_names(out, overwrite=request.overwrite)
-    with tempfile.TemporaryDirectory(prefix=".again-", dir=out) as folder:
+    lock = FolderLock(out)
+    with tempfile.TemporaryDirectory(prefix=AGAIN, dir=out) as folder:
         again = replace(request, template=AUTO, out=Path(folder))
-        summary, _ = _measure(again, stop=stop, observer=observer)
+        try:
+            summary, _ = _measure(again, stop=stop, observer=observer)
+        finally:
+            lock.release()
         if stop.is_set():
             observer.warn(f"stopped before that: {out} has the lengths by the mesh that was given")
             return first

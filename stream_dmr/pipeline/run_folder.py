@@ -1,5 +1,6 @@
 """Prepare the output folder of a run, and recover it after a crash."""
 
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
@@ -10,7 +11,7 @@ from pathlib import Path
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.seal import known_files, read_origin, sign_found
-from stream_dmr.files import free_name, require_unlocked, writing_to
+from stream_dmr.files import free_name, is_locked, require_unlocked, writing_to
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.reading import messages_of, open_recordings
 from stream_dmr.recording.recorder import STEM
@@ -30,6 +31,7 @@ RESULTS = (
     PROVENANCE,
 )
 SEGMENTS = f"{STEM}-*"  # the recordings of an endless run
+AGAIN = ".again-"  # folders in which fish are measured again
 ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", SEGMENTS)
 _writing_to = partial(writing_to, what="a folder", remedy="choose another --out")
 _PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
@@ -124,6 +126,14 @@ def _recordings(out: Path, pattern: str) -> list[Path]:
     return sorted(path for path in out.glob(pattern) if {".mcap", ".rrd"} & {*path.suffixes})
 
 
+def remove_unfinished(out: Path) -> bool:
+    """Remove what was measured again, and not to its end, when a run was killed; True if any."""
+    found = [] if is_locked(out) else list(out.glob(f"{AGAIN}*"))
+    for path in found:
+        shutil.rmtree(path, ignore_errors=True)
+    return bool(found)
+
+
 FROM_RECORDING = "taken over from the recording"
 
 
@@ -136,6 +146,11 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
     require_unlocked(folder)
+    if remove_unfinished(folder):
+        yield (
+            f"{folder}: has the lengths by the mesh that was given, which the fish are not like: "
+            "the run was killed while it measured them again; begin it anew"
+        )
     signer = Signer(key)
     repairs = list[Repair]()
     for repair in repair_recordings(folder):

@@ -228,7 +228,12 @@ def resume_source(
 
     source.listen(on_notice if source.is_live else on_notice_of_clip)
     source.resume(
-        ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
+        ResumePoint(
+            after_ns=after_ns,
+            clips_done=frozenset(done),
+            frames_done=frames_done,
+            mark_done=store.clip_done,
+        )
     )
     return frames_done if source.has_clips else None
 

@@ -165,6 +165,7 @@ def _not_read(names: list[str]) -> str:
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
 _MAX_EARLY_S = 3600.0  # of a clip's end, before the latest; chosen
+_DAY_NS = 86_400_000_000_000  # to come, of a clip's end: more than a time zone is off; chosen
 _SETTLE_S = 5.0  # a clip that has not grown for so long is complete, or never will be; chosen
 _PAUSE_CLIPS = 2.0  # clips' durations without a new clip after which its fish are gone; chosen
 _POLL_S = 0.5
@@ -184,8 +185,8 @@ class ClipFolder(Source):
     Frames are numbered through all clips. A clip is read once it has stopped growing or a later
     clip is there; frames that it receives after that, such as after a pause of its recorder, are
     read as well. A clip that can't be read, or has another size, is left out with a warning.
-    Capture times: a clip ends when its file was last modified, but never begins before its
-    predecessor ended.
+    Capture times: a clip ends when its file was last modified, unless that is a day or more to
+    come, but never begins before its predecessor ended.
     """
 
     is_endless = True  # the folder may grow; it ends when no new clip came for `clips_wait_s`
@@ -206,6 +207,7 @@ class ClipFolder(Source):
         self._after_ns = 0
         self._latest_ns = 0  # the latest end of a clip, by its file
         self._is_early = False  # the last clip came late, or after a wrong time
+        self._mark_done: Callable[[str], object] = str
         self._on_pause: Callable[[], None] = lambda: None
         self._clip_s = 0.0  # duration of the last clip
         self._video: VideoFile | None = None
@@ -222,6 +224,7 @@ class ClipFolder(Source):
         self._begun.update(point.clips_done)
         self._frames_done = {**point.frames_done}
         self._after_ns = self._latest_ns = point.after_ns
+        self._mark_done = point.mark_done
 
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
@@ -234,17 +237,16 @@ class ClipFolder(Source):
             self._video = self._open(path)
             if self._video is None:
                 continue
-            # It ended with the last write; 0 if it was removed meanwhile.
-            state, duration_s = _state_of(path), (self._video.num_frames or 0) / self._video.fps
-            self._clip_s = duration_s
-            start_ns = 0 if state is None else state.modified_ns - round(duration_s * 1e9)
+            self._clip_s = (self._video.num_frames or 0) / self._video.fps
+            ended_ns = self._ended_ns(path)
+            start_ns = ended_ns - round(self._clip_s * 1e9)
             next_ns = last_ns + round(1e9 / self._video.fps)
             done = self._frames_done.get(path.name, 0)
             for frame in self._whole_frames(self._video):
                 frame_index += 1
                 if frame.frame_index == done + 1:  # frames read before may lie before the last time
-                    if state is not None:
-                        self._note_early(path.name, state.modified_ns)
+                    if ended_ns:
+                        self._note_early(path.name, ended_ns)
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
                 last_ns = max(last_ns, start_ns + frame.timestamp_ns)
                 if frame.frame_index > done:
@@ -296,7 +298,7 @@ class ClipFolder(Source):
     def _has_more(self, path: Path) -> bool:
         """True for a clip that was not read, or has grown since; names one that was replaced."""
         if path.name not in self._begun:
-            return True
+            return not self._is_renamed(path)
         state, before = _state_of(path), self._read.get(path.name)
         if state is None or before is None:
             return False
@@ -304,6 +306,31 @@ class ClipFolder(Source):
         if state.num_bytes <= before.num_bytes and later_s > _SETTLE_S:
             self._note_rewritten(path.name)
         return state.num_bytes > before.num_bytes
+
+    def _is_renamed(self, path: Path) -> bool:
+        """True for a clip that was read by another name, which is gone; says so."""
+        state = _state_of(path)
+        same = [name for name, read in self._read.items() if read == state]
+        before = next((name for name in same if not (self._folder / name).exists()), None)
+        if state is None or before is None:
+            return False
+        self._begun.add(path.name)
+        self._read[path.name] = state
+        self._mark_done(path.name)
+        self._on_notice(f"{path.name}: is {before} by another name, so is not read again")
+        return True
+
+    def _ended_ns(self, path: Path) -> int:
+        """When a clip ended, with its last write; 0 if unknown: it follows the clip before it."""
+        state, now_ns = _state_of(path), time.time_ns()
+        if state is None or state.modified_ns <= now_ns + _DAY_NS:
+            return 0 if state is None else state.modified_ns
+        days = (state.modified_ns - now_ns) / _DAY_NS
+        self._on_notice(
+            f"{path.name}: by its time of change it ends in {days:.1f} days, so its times are "
+            "those after the clip before it; set the recorder's clock"
+        )
+        return 0 if self._latest_ns else now_ns
 
     def _note_early(self, name: str, ended_ns: int) -> None:
         early_s = (self._latest_ns - ended_ns) / 1e9

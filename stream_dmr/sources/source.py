@@ -38,6 +38,7 @@ class ResumePoint:
     after_ns: int = 0  # the last capture time; every later one must be larger
     clips_done: frozenset[str] = frozenset()  # names of clips that were read to their end
     frames_done: Mapping[str, int] = field(default_factory=dict[str, int])  # of the other clips
+    mark_done: Callable[[str], object] = str  # takes the name of a clip that needs no reading
 
 
 class Source(ABC):

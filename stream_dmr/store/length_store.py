@@ -278,6 +278,11 @@ class LengthStore:
                 self._rows.pending.append((_CLIP, (*self._clip, 1)))
             self._clip = name, frames_done
 
+    def clip_done(self, name: str) -> None:
+        """Mark a clip that needs no measuring; durable likewise."""
+        with self._lock:
+            self._rows.pending.append((_CLIP, (name, 0, 1)))
+
     def clips_before(self) -> tuple[set[str], dict[str, int]]:
         """The clips that earlier runs have finished, and the frames done of others."""
         clips = list(rows(self._rows.database, CLIPS))

@@ -22,6 +22,7 @@ from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.learn_shapes import learnt_from, with_learnt_shapes
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import ReplayOptions, replay
+from stream_dmr.pipeline.run_folder import recover_folder
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import RunOptions
@@ -295,10 +296,15 @@ def test_a_mesh_of_other_fish_is_not_believed(
 
 def test_a_stop_while_fish_are_measured_again_keeps_the_first_lengths(clip: Path, tmp_path: Path):
     observer = Listener(stop_after=6)  # of four frames each time
+    (tmp_path / "out" / ".again-1").mkdir(parents=True)  # of a run that was killed meanwhile
     out = measured(clip, tmp_path / "out", observer, template=str(clip / "slim.ply")).out
     assert [line for line in observer.warnings if "has the lengths by the mesh" in line]
     (row,) = rows(out / "lengths.csv")
     assert row["frames_seen"] == "4"
+    assert not list(out.glob(".again*"))
+    (out / ".again-1").mkdir()
+    (line,) = recover_folder(out)
+    assert line.endswith("the run was killed while it measured them again; begin it anew")
     assert not list(out.glob(".again*"))
     assert verify(out)[0] == []
 

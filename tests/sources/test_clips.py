@@ -71,12 +71,23 @@ def test_clips_that_overlap_in_time_are_set_one_after_the_other(tmp_path: Path):
 def test_clips_after_one_with_a_wrong_time_are_said_once(tmp_path: Path):
     for number in (1, 2, 3, 4):
         clip(tmp_path / f"{number}.avi", first=number)
-    os.utime(tmp_path / "2.avi", (OLD_S + 10**8,) * 2)
+    os.utime(tmp_path / "2.avi", (OLD_S + 10**7,) * 2)
     folder = open_source(str(tmp_path), AT_ONCE)
     times = [frame.timestamp_ns for frame in folder]
     assert all(a < b for a, b in itertools.pairwise(times))
     (warning,) = folder.warnings
-    assert warning.startswith("3.avi: by its time of change it is 99999997 s older")
+    assert warning.startswith("3.avi: by its time of change it is 9999997 s older")
+
+
+def test_a_clip_of_a_time_to_come_moves_no_other(tmp_path: Path):
+    for number in (1, 2, 3):
+        clip(tmp_path / f"{number}.avi", first=number)
+    os.utime(tmp_path / "2.avi", (OLD_S + 10**10,) * 2)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    times = [frame.timestamp_ns for frame in folder]
+    assert [round((time_ns - times[0]) / 1e6) for time_ns in times[4::4]] == [160, 2000]
+    (warning,) = folder.warnings
+    assert warning.startswith("2.avi: by its time of change it ends in ")
 
 
 def test_copies_of_long_clips_are_not_early(tmp_path: Path):
@@ -213,6 +224,20 @@ def test_a_clip_that_replaces_one_of_its_name_is_said(tmp_path: Path):
     assert numbers([*first, *frames]) == [1, 2, 3, 4, 2, 3, 4, 5]
     assert len(folder.warnings) == 1
     assert "1.avi: was written again after it was read" in folder.warnings[0]
+
+
+def test_a_clip_that_is_renamed_after_it_was_read_is_not_read_again(tmp_path: Path):
+    """As by a recorder that names a clip when it is done; also after a restart."""
+    for number in (1, 2):
+        clip(tmp_path / f"{number}.avi", first=number)
+    folder, done = ClipFolder(tmp_path, AT_ONCE), list[str]()
+    folder.resume(ResumePoint(mark_done=done.append))
+    frames = iter(folder)
+    first = list(itertools.islice(frames, 5))
+    (tmp_path / "1.avi").rename(tmp_path / "7.avi")
+    assert numbers([*first, *frames]) == [1, 2, 3, 4, 2, 3, 4, 5]
+    assert done == ["7.avi"]
+    assert folder.warnings == ["7.avi: is 1.avi by another name, so is not read again"]
 
 
 def test_closing_ends_the_wait_for_a_clip(tmp_path: Path):
