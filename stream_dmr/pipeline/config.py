@@ -39,6 +39,7 @@ class HaulsSettings(Settings):
     pause_min: float = Field(
         default=0.0,
         ge=0,
+        le=1e9,
         description="a haul begins with a fish, and ends with the last one before so many minutes "
         "without any; 0: no hauls by rule",
     )

@@ -21,6 +21,7 @@ class SensorsSettings(Settings):
     max_gap_s: float = Field(
         default=60.0,
         gt=0,
+        le=1e9,
         description="between positions further apart than this none is interpolated, s",
     )
     silence_s: float = Field(
@@ -34,6 +35,7 @@ class SensorsSettings(Settings):
     keep_s: float = Field(
         default=10.0,
         ge=0,
+        le=1e9,
         description="time between the positions that lengths.db keeps, s; a recording has all",
     )
     baud: int = Field(default=4800, ge=300, le=921600, description="of a serial receiver, bit/s")

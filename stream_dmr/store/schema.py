@@ -417,6 +417,8 @@ def _refusal(path: Path, error: sqlite3.Error | OSError, *, remedy: str) -> Outp
     kind = DiskRefusal if code in _DISK_ERRORS else OutputError
     if code == sqlite3.SQLITE_FULL:  # another database would find no room either
         remedy = "make room or choose another --out"
+    if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN):
+        remedy = "give this user access to its folder, or work on a copy"
     return kind(f"{path}: expected a database of lengths, got: {error}; {remedy}")
 
 

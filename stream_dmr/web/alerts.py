@@ -122,7 +122,7 @@ def _kinds(problems: Sequence[str]) -> list[str]:
 def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
     deliveries: list[Callable[[Alert], None]] = []
     if settings.webhook:
-        if not settings.webhook.startswith(("http://", "https://")):
+        if not re.fullmatch(r"https?://[^/?#\s]+\S*", settings.webhook):
             raise ConfigError(
                 f"[alerts] webhook: expected http://... or https://..., got {settings.webhook!r}"
             )

@@ -96,6 +96,9 @@ MISTAKES = {
     "[localize]\nmin_iou = nan": (
         " [localize]: 'min_iou' expected a number at least 0 and at most 1, received nan"
     ),
+    "[hauls]\npause_min = 1e300": (  # which had no nanoseconds
+        " [hauls]: 'pause_min' expected a number at least 0 and at most 1e+09, received 1e+300"
+    ),
     "[localize]\nmin_iou = 'big'": (
         " [localize]: 'min_iou' expected a number at least 0 and at most 1, "
         'received the string "big"'

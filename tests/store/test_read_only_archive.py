@@ -62,6 +62,12 @@ def test_verdicts_on_an_archive_are_refused_in_one_line(archive: Path):
     assert "\n" not in str(refusal.value)
 
 
+def test_a_haul_of_an_archive_is_refused_with_what_helps(archive: Path):
+    outcome = invoke("haul", {"start": None, str(archive): None, "--at": "1"})
+    assert outcome.code == 2
+    assert "give this user access to its folder" in outcome.err
+
+
 def test_recover_says_that_an_archive_can_not_be_repaired(archive: Path, tmp_path: Path):
     torn = Path(shutil.copytree(archive, tmp_path / "torn"))
     (torn / "recording.mcap").rename(torn / "recording.mcap.part")

@@ -308,7 +308,8 @@ def test_settings_that_do_not_fit_are_refused(apprise_file: Callable[..., AlertS
         (["# json://a"], "expected an address of apprise a line, got none"),
     ):
         assert expected in refusal(apprise_file(*lines))
-    assert "expected http://" in refusal(AlertSettings(webhook="ftp://example.org"))
+    for webhook in ("ftp://example.org", "http://", "https:///hook", "http://example.org/a b"):
+        assert "expected http://" in refusal(AlertSettings(webhook=webhook))
     for webhook in ("https://box:secret@example.org/hook", "http://secret@[::1/"):
         assert "without user:password@" in refusal(AlertSettings(webhook=webhook))
     assert "expected a file with" in refusal(AlertSettings(apprise_file="missing.txt"))
