@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import ModelError, OutputError
-from stream_dmr.files import make_folder
+from stream_dmr.files import make_folder, sha256_of
 from stream_dmr.networks.unet import SHIPPED, load_weights
 from stream_dmr.segmentation.segmenter import resize
 from stream_dmr.training.annotated_images import (
@@ -188,9 +188,15 @@ def _prepare(request: TrainRequest) -> UNetTrainer:
         device=torch.device(request.device),
         out=make_folder(request.out),
         is_fine_tuning=init is not None,
+        init_sha256="" if init is None else sha256_of(init),
     )
     if request.resume:
         training.resume()
+        if request.init is not None and sha256_of(request.init) != training.init_sha256:
+            raise ModelError(
+                f"--init {request.init}: expected the weights that this training began with, got "
+                "others, which --resume would not use; give those, or another --out"
+            )
     else:
         training.begin(network)
     return training

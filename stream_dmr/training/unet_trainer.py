@@ -125,6 +125,7 @@ class UNetTrainer:
     device: torch.device
     out: Path
     is_fine_tuning: bool
+    init_sha256: str = ""  # of the weights that it began with
 
     def __post_init__(self) -> None:
         torch.manual_seed(self.settings.seed)
@@ -158,6 +159,7 @@ class UNetTrainer:
                 f"{path}: expected a checkpoint of the same settings, got one of others; give the "
                 "config of that run, or another --out"
             )
+        self.init_sha256 = state.get("init", self.init_sha256)  # older ones lack it
         self.network.load_state_dict(state["network"])
         self.averaged.load_state_dict(state["averaged"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -242,6 +244,7 @@ class UNetTrainer:
             export_unet(network, self.out / "unet.onnx")
         state = {
             "settings": self._identity(),
+            "init": self.init_sha256,
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),

@@ -86,6 +86,9 @@ def test_fine_tuning_ends_where_nothing_improves_and_never_with_worse_weights(tm
         np.testing.assert_array_equal(value.numpy(), other[name].numpy())
     train_unet(request(tmp_path, settings=wild, resume=True, init=SHIPPED), stop=never())
     assert len(history(tmp_path)) == 2  # it was over
+    other = tmp_path / "unet.pt"
+    with pytest.raises(ModelError, match="expected the weights that this training began with"):
+        train_unet(request(tmp_path, settings=wild, resume=True, init=other), stop=never())
     assert (tmp_path / "worst.png").exists()
 
 
