@@ -195,12 +195,15 @@ class TrackEditor:
     ) -> TrackEdit:
         """Measure a missed fish in the drawn boxes; `time_ns`: times of the first and last box."""
         new_fish, part = self._new_fish(), part_at(report.recording, time_ns[0])
-        frames, fish, is_original = measure_boxes(
-            list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
-            drawn,
-            track_id=new_fish,
-            part=part,
-        )
+        found = list(self._pictures.frames((time_ns[0], time_ns[1] + 1)))
+        numbers = {shown.frame.frame_index for shown in found}
+        # Given masks number the frames of each run anew.
+        if part_at(report.recording, time_ns[1]) is not part or len(numbers) < len(found):
+            raise UserError(
+                "verdict: expected boxes in frames of one run, got some of the next run too; add a "
+                "fish of either"
+            )
+        frames, fish, is_original = measure_boxes(found, drawn, track_id=new_fish, part=part)
         if not fish:
             raise UserError("verdict: expected boxes inside the picture, got none")
         flags = [ADDED, *([] if is_original else [OTHER_PIXELS])]

@@ -12,7 +12,7 @@ import trimesh
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.camera import ReferencePlane, crop_from_frame
-from stream_dmr.errors import RecordingError
+from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.export.exporter import Export
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
@@ -53,7 +53,7 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dark.release()
     add_clip(clip, "3.mp4", video="dark.mp4")
     with (clip / "quick.toml").open("a") as config:
-        config.write("\n[smooth_length]\nmin_frame_std_ratio = 0.1\n\n[watch]\nport = 8099\n")
+        config.write("\n[smooth_length]\nmin_frame_std_ratio = 0.1\n\n[watch]\nstuck_s = 99.0\n")
     plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, 4000.0]))
     save_calibration(clip / "calibration.yaml", replace(calibration(), plane=plane))
     write_template(clip, "broad", half_breadth=22)
@@ -114,6 +114,18 @@ def test_a_reviewer_works_by_the_inputs_of_the_fish(changed: Path, fish: int):
     )
     assert stored[fish + 1].length_std_mm == measured[fish + 1].length_std_mm
     assert verify(changed)[0] == []
+
+
+def test_a_fish_is_not_added_across_two_configs(changed: Path):
+    report = open_report(changed)
+    box = {"x0": 8.0, "y0": 18.0, "x1": 52.0, "y1": 104.0}
+    ends = report.tracks[1].rows[-2].fish, report.tracks[3].rows[-1].fish
+    drawn = [
+        box | {"frame_index": f.frame_index, "timestamp_ns": str(f.timestamp_ns)} for f in ends
+    ]
+    said = {"kind": "add", "boxes": drawn, "sure": True}
+    with pytest.raises(UserError, match="expected boxes in frames of one run"):
+        ReviewQueue([report], reviewer="Ada").record(json.dumps(said).encode())
 
 
 def test_verify_asks_no_length_of_an_added_fish_whose_settings_were_deleted(
