@@ -73,11 +73,13 @@ def verify(
 
 
 def report(
-    path: Annotated[
-        Path,
-        typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            help="The --out of runs or of batches, or recordings.", metavar="DIR|REC..."
+        ),
     ],
-    out: Annotated[Path | None, "The page to write.", "report.html in the folder"] = None,
+    out: Annotated[Path | None, "The page to write.", "report.html in the only folder"] = None,
     source: PicturesOption = None,
     config: FisheriesOption = None,
     coast: Annotated[Path | None, "Coastlines for the map, as GeoJSON in degrees."] = None,
@@ -89,11 +91,14 @@ def report(
     from stream_dmr.web.trip_map import load_coast
 
     if out is None:
-        out = (path if path.is_dir() else path.parent) / "report.html"
+        if len(paths) > 1:
+            raise UserError(f"--out: expected the page to write of {len(paths)} results, got none")
+        out = (paths[0] if paths[0].is_dir() else paths[0].parent) / "report.html"
     require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
     shores = [] if coast is None else load_coast(coast)
-    reports, failed = open_folders([path], source=source, config=config)
-    size = write_report(reports, out, title=path.resolve().name, notes=failed, coast=shores)
+    reports, failed = open_folders(paths, source=source, config=config)
+    title = ", ".join(path.resolve().name for path in paths)
+    size = write_report(reports, out, title=title, notes=failed, coast=shores)
     warn(line for report in reports for line in report.recording.warnings)
     print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")
 

@@ -44,9 +44,10 @@ class ReviewQueue:
             require_recording(report.recording, where=report.path, what="a review")
         self.placed = place(reports)
         self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
-        self._measured = set[int]() if sample is None else measured_numbers(self.placed)
+        measured = [] if sample is None else measured_numbers(self.placed)
+        self._measured = {*measured}
         self._last = [recorder.last() for recorder in self._recorders]
-        self._chosen = None if sample is None else sampled(self._measured, sample)
+        self._chosen = None if sample is None else sampled(measured, sample)
         self._about: dict[str, Any] = {"reviewer": reviewer, "blind": blind}
         self._about["species"] = species_choices(reports[0].config.species.own_list)
         if sample is not None:
@@ -163,21 +164,26 @@ def species_choices(own_list: str) -> list[dict[str, str]]:
     ]
 
 
-def measured_numbers(placed: Sequence[PlacedReport]) -> set[int]:
-    """The numbers, in the page, of the fish that were measured."""
-    return {
-        part.row_id(fish.estimate.track_id)
-        for part in placed
+def measured_numbers(placed: Sequence[PlacedReport]) -> list[int]:
+    """The numbers, in the page, of the fish that were measured, by their folders' paths.
+
+    Their order is the same in whatever order the folders are given.
+    """
+    return [
+        number
+        for part in sorted(placed, key=lambda part: part.report.path.resolve())
         if (database := database_of(part.report.path)) is not None
-        for fish in read_measured_fish(database)
-    }
+        for number in sorted(
+            part.row_id(fish.estimate.track_id) for fish in read_measured_fish(database)
+        )
+    ]
 
 
-def sampled(numbers: set[int], sample: AuditSample) -> set[int]:
+def sampled(numbers: Sequence[int], sample: AuditSample) -> set[int]:
     """A random sample of the numbers; equal seeds draw equal samples."""
     rng = np.random.default_rng(sample.seed)
     size = min(sample.size, len(numbers))
-    return set(rng.choice(sorted(numbers), size, replace=False).tolist())
+    return set(rng.choice(numbers, size, replace=False).tolist())
 
 
 class ReviewServer(TokenServer):

@@ -1,6 +1,7 @@
 """Agreement of readings: known answers, and what no pair of readers can exceed."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,27 @@ def test_equal_seeds_draw_equal_fish(out: Path):
     queue = ReviewQueue([open_report(out)] * 2, reviewer="Ada", sample=AuditSample(size=2, seed=3))
     text = queue.page("x")
     again = ReviewQueue([open_report(out)] * 2, reviewer="Bo", sample=AuditSample(size=2, seed=3))
-    everything = measured_numbers(queue.placed)
-    assert everything == {1, 2, 1_000_000_001, 1_000_000_002}
-    drawn = sampled(everything, AuditSample(size=2, seed=3))
+    everything = {*(numbers := measured_numbers(queue.placed))}
+    assert numbers == [1, 2, 1_000_000_001, 1_000_000_002]
+    drawn = sampled(numbers, AuditSample(size=2, seed=3))
     assert len(drawn) == 2
-    assert drawn < everything == sampled(everything, AuditSample(size=99))
+    assert drawn < everything == sampled(numbers, AuditSample(size=99))
     for page in (text, again.page("x")):
         assert {number for number in everything if f'id="fish-{number}"' in page} == drawn
     assert run_folders([out]) == [out]
+
+
+def test_a_sample_is_the_same_in_whatever_order_the_folders_are_given(out: Path, tmp_path: Path):
+    folders = [out, Path(shutil.copytree(out, tmp_path / "another"))]
+    drawn: list[set[str]] = []
+    for paths in (folders, folders[::-1]):
+        reports = [open_report(path) for path in paths]
+        sample = AuditSample(size=1, seed=3)
+        queue = ReviewQueue(reports, reviewer="Ada", sample=sample)
+        (number,) = sampled(measured_numbers(queue.placed), sample)
+        drawn.append({f"{paths[number // 10**9]} {number % 10**9}"})
+    assert drawn[0] == drawn[1]
+    page = {str(folders[0]): None, str(folders[1]): None}
+    refused = invoke("report", page)
+    assert "--out: expected the page to write" in refused.error
+    assert "4 fish" in invoke("report", page | {"--out": str(tmp_path / "both.html")}).out
