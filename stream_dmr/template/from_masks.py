@@ -174,6 +174,11 @@ def _on_axis(*places: float) -> Float[np.ndarray, "N 3"]:
 
 def _read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     """Pixels above 0, in any channel. Raises TemplateError."""
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        raise TemplateError(
+            f"{path}: expected a mask such as a PNG, got a JPEG, which has pixels above 0 beside "
+            "the fish too; save the mask as a PNG where it was drawn"
+        )
     if huge := size_if_huge(path):
         raise TemplateError(
             f"{path}: expected a mask of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"

@@ -21,6 +21,7 @@ from stream_dmr.template.template import JOINTS, Template, canonical_template
 BUNDLED = Path(__file__).parent / "bundled"
 TAILS = ("fork", "total")
 _MAX_COORDINATE = 1e12  # in any unit; squares of coordinates must stay finite
+_MIN_THICKNESS = 0.003  # chosen: std of vertices through the body over that along it
 
 
 def load_template(
@@ -119,6 +120,12 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         raise TemplateError(
             f"template {path}: expected faces of its {len(mesh.vertices)} vertices, got others; "
             "the file is damaged"
+        )
+    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
+    if spread[2] < _MIN_THICKNESS * spread[0]:
+        raise TemplateError(
+            f"template {path}: expected a body, got a flat mesh, of a thickness of "
+            f"{spread[2] / spread[0]:.1g} of its length; give it one, all axes in the same unit"
         )
     # Some formats repeat a vertex for each face, or along the seams of a texture.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)

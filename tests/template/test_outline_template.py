@@ -119,16 +119,21 @@ def test_the_command_writes_a_template_and_says_what_it_found(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
-    [(None, "can't be read"), (b"", "expected a picture of a mask"), (b"text", "of a mask")],
+    ("content", "message", "name"),
+    [
+        (None, "can't be read", "side.png"),
+        (b"", "expected a picture of a mask", "side.png"),
+        (b"text", "of a mask", "side.png"),
+        (None, "got a JPEG", "side.JPG"),
+    ],
 )
 def test_a_mask_that_is_none_is_refused_in_one_line(
-    tmp_path: Path, content: bytes | None, message: str
+    tmp_path: Path, content: bytes | None, message: str, name: str
 ):
-    side = tmp_path / "side.png"
+    side = tmp_path / name
     if content is not None:
         side.write_bytes(content)
-    with pytest.raises(TemplateError, match=f"side.png: expected a .*mask.*{message}|{message}"):
+    with pytest.raises(TemplateError, match=f"{name}: expected a .*mask.*{message}|{message}"):
         template_from_masks(side, name="x")
 
 

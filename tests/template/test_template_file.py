@@ -101,6 +101,11 @@ def with_nan():
     return trimesh.Trimesh(vertices, mesh.faces, process=False)
 
 
+def thin(share):
+    mesh = fish_mesh()
+    return trimesh.Trimesh(mesh.vertices * [1.0, 1.0, share], mesh.faces, process=False)
+
+
 class TestRefusals:
     """Each says the file, what was expected and what came, in one line."""
 
@@ -116,6 +121,8 @@ class TestRefusals:
         [
             (with_nan, "expected finite vertices, got NaN"),
             (lambda: trimesh.Trimesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "empty"),
+            (lambda: thin(1e-4), "expected a body, got a flat mesh"),
+            (lambda: thin(0.0), "expected a body, got a flat mesh"),
             (lambda: trimesh.creation.box(fish_mesh().extents), "got none within 0.1 body lengths"),
         ],
     )
