@@ -146,6 +146,11 @@ def _convert(
 def _as_rrd(recording: str, source: str | None, selection: Selection) -> Generator[str]:
     """The given .rrd or address; for an .mcap, a part, or with a source, a new .rrd."""
     if "://" in recording:
+        if source is not None or not selection.is_everything:
+            raise UserError(
+                f"{recording}: expected an address without --source, --time and --track, which are "
+                "for recordings; leave them out"
+            )
         yield recording
         return
     path = Path(recording)

@@ -298,6 +298,7 @@ NOTHING = {
     "view REC --frame 3": "--frame: expected with --screenshot alone",
     "view REC --port 8000": "--port: expected with --web alone",
     "view REC --screenshot a.jpg": "end it in .png",
+    "view rerun+http://x:9876/proxy --track 3": "expected an address without --source",
     "batch a.csv --out x --gpus 1": "--gpus: expected with --engine ray alone",
     "batch a.csv --out x --address auto": "--address: expected with --engine ray alone",
     "batch a.csv --out x --engine ray --workers 2": "--workers: expected with --engine local alone",
