@@ -21,6 +21,7 @@ from stream_dmr.template.template import JOINTS, Template, canonical_template
 BUNDLED = Path(__file__).parent / "bundled"
 TAILS = ("fork", "total")
 _MAX_COORDINATE = 1e12  # in any unit; squares of coordinates must stay finite
+_MANY_FACES = 20_000  # chosen: with 43,000 a run takes twice, with 172,000 twelve times as long
 _MIN_THICKNESS = 0.003  # chosen: std of vertices through the body over that along it
 
 
@@ -33,8 +34,8 @@ def load_template(
     name and holds `joints` (two or more points, in any order) and `[keypoints] head, center, tail`,
     in the mesh's own coordinates; its `[length]` may name the length that ends at the tail
     keypoint, `tail = "fork"` or `"total"`, and `total_per_fork`. Without a TOML, the points are
-    found (see `find_points`). `on_notice` is called with one line about repairs, and one about the
-    points found. Raises TemplateError if mesh or TOML can't be used.
+    found (see `find_points`). `on_notice` is called with one line about repairs, one about
+    many faces and one about the points found. Raises TemplateError if mesh or TOML can't be used.
     """
     mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
     if not mesh_path.is_file():
@@ -45,6 +46,11 @@ def load_template(
     repaired = repair_mesh(_read_mesh(mesh_path), name=str(path))
     if repaired.changes:
         on_notice(f"template {path}: repaired: {', '.join(repaired.changes)}")
+    if (num_faces := len(repaired.mesh.faces)) > _MANY_FACES:
+        on_notice(
+            f"template {path}: its {num_faces} faces make runs slow, and some 3000 are enough; "
+            "simplify it, in Blender by Decimate, or by trimesh's simplify_quadric_decimation"
+        )
     toml = mesh_path.with_suffix(".toml")
     table: dict[str, Any] = {}
     if toml.is_file():

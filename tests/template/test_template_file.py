@@ -80,6 +80,13 @@ def test_without_a_toml_the_points_are_found_and_told(tmp_path):
     assert template.tail_gives is None
 
 
+def test_a_mesh_of_many_faces_is_taken_and_told(tmp_path):
+    notices: list[str] = []
+    load_template(write_fish(tmp_path, mesh=fish_mesh(subdivisions=5)), on_notice=notices.append)
+    assert len(notices) == 1
+    assert "its 20480 faces make runs slow" in notices[0]
+
+
 def test_what_is_saved_is_what_is_read(tmp_path):
     template = load_template("tuna")
     save_template(template, tmp_path / "again.ply", comment="a copy")
