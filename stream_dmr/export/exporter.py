@@ -38,7 +38,6 @@ from stream_dmr.pipeline.run_inputs import species_notes
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.reading import (
     decoded_messages,
-    header_at,
     messages_of,
     part_at,
     require_messages,
@@ -52,7 +51,7 @@ from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import Fish, database_of, read_fish, read_runs
-from stream_dmr.store.open_results import open_results, require_recording
+from stream_dmr.store.open_results import open_results, require_recording, template_of_fish
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, write_lengths
 from stream_dmr.store.scale_checks import last_checks
@@ -308,7 +307,7 @@ class Export:
 
     def _template(self, fish: Fish) -> Template:
         """The template by which a fish was measured."""
-        return header_at(self.recording, fish.estimate.last_timestamp_ns).template
+        return template_of_fish(self.recording, fish)
 
     @cached_property
     def _left_out(self) -> set[int]:

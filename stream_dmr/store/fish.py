@@ -10,7 +10,7 @@ from typing import Any
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.recording.header import RunInputs
-from stream_dmr.recording.reading import Recording, messages_of, recorded_settings
+from stream_dmr.recording.reading import Recording, header_at, messages_of, recorded_settings
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.species import CODE, UNSURE, Species, find_species, load_species
@@ -142,9 +142,14 @@ def read_fish(path: Path, recording: Recording, selection: Selection = EVERYTHIN
             if selection.includes(known.estimate)
             and selection.includes_time(known.estimate.last_timestamp_ns)
         ]
-    facts, track = run_facts(recording.header), recorded_track(recording)
+    facts_of, track = cache(run_facts), recorded_track(recording)
     return [
-        Fish(estimate=estimate, facts=facts, run_id="", where=track.at(middle_ns(estimate)))
+        Fish(
+            estimate=estimate,
+            facts=facts_of(header_at(recording, estimate.last_timestamp_ns)),
+            run_id="",
+            where=track.at(middle_ns(estimate)),
+        )
         for estimate in messages_of(recording, LengthEstimate, selection)
         if estimate.is_final
     ]
@@ -204,7 +209,11 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
             ]
             known.sort(key=lambda pair: max(pair[0].first_frame, pair[1].estimate.first_frame))
             estimate = _with_catch(estimate_of(edited.row), known)
-            run_id = known[0][1].run_id if known else list(runs)[-1]  # that of its first frames
+            began_ns = estimate.first_timestamp_ns
+            beside = [fish for _, fish in known[:1]] or sorted(  # an added fish: the nearest one
+                tracks.values(), key=lambda fish: abs(fish.estimate.first_timestamp_ns - began_ns)
+            )
+            run_id = beside[0].run_id if beside else [*runs][-1]  # that of its first frames
             made[track_id] = fish(edited.row, estimate, run_id, origin=edited.kind)
     except (ValueError, KeyError) as error:
         raise OutputError(

@@ -18,11 +18,11 @@ from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.messages import Message
 from stream_dmr.recording.codec import encode
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.reading import Recording, files_of, open_recordings
+from stream_dmr.recording.reading import Recording, files_of, header_at, open_recordings
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import TOPICS, MessageTypes, Topics
 from stream_dmr.store.batch_folder import VIDEO_FOLDERS, VIDEOS
-from stream_dmr.store.fish import database_of, read_runs
+from stream_dmr.store.fish import Fish, database_of, read_runs
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
 
@@ -95,6 +95,18 @@ def require_recording(recording: Recording, *, where: object, what: str) -> None
         )
 
 
+def template_of_fish(recording: Recording, fish: Fish) -> Template:
+    """The template by which a fish was measured, also if its part of the recording was deleted."""
+    template = header_at(recording, fish.estimate.last_timestamp_ns).template
+    made_by = fish.facts.template_sha256
+    return template if _sha256_of(template) == made_by else _template_by(made_by, AUTO)
+
+
+@cache
+def _sha256_of(template: Template) -> str:
+    return sha256(encode(template)).hexdigest()
+
+
 @cache
 def _template_by(hash_hex: str, likely: str) -> Template:
     """The likely or the bundled template with this SHA-256.
@@ -103,7 +115,7 @@ def _template_by(hash_hex: str, likely: str) -> Template:
     """
     for name in (likely, AUTO, *bundled_names()):
         template, _ = load_shapes(name)
-        if sha256(encode(template)).hexdigest() == hash_hex:
+        if _sha256_of(template) == hash_hex:
             return template
     midline = np.linspace([-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], 3)
     return Template(

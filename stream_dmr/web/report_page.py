@@ -20,11 +20,12 @@ from stream_dmr.export.fish_table import fish_record
 from stream_dmr.fitting.shape.candidates import AUTO, describe, load_shapes
 from stream_dmr.lengths.fate import CONDITIONS, FATES
 from stream_dmr.pipeline.config import Config
-from stream_dmr.recording.reading import Recording, header_at, known_shapes, part_at
+from stream_dmr.recording.reading import Recording, known_shapes, part_at
 from stream_dmr.store.edits import NO_EDITS, TrackEdits
 from stream_dmr.store.effort import HaulEffort
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import FisheriesSettings
+from stream_dmr.store.open_results import template_of_fish
 from stream_dmr.store.run_facts import RunFacts
 from stream_dmr.store.trip import VesselTrack
 from stream_dmr.tables import utc_text
@@ -262,7 +263,7 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: its row of fish.csv, and a thumbnail of its best view."""
-    template = header_at(report.recording, fish.estimate.last_timestamp_ns).template
+    template = template_of_fish(report.recording, fish)
     record = fish_record(fish, template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}

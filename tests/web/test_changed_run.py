@@ -1,5 +1,6 @@
 """A run that went on in its folder with another config, calibration and template."""
 
+import csv
 import json
 import shutil
 from dataclasses import replace
@@ -16,6 +17,7 @@ from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.export.exporter import Export
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
+from stream_dmr.pipeline.config import Config
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.reading import messages_of, open_recordings
 from stream_dmr.store.fish import read_measured_fish, read_stored_fish
@@ -65,6 +67,13 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lengths(out: Path) -> dict[int, float]:
     estimates = [fish.estimate for fish in read_measured_fish(out / "lengths.db")]
     return {one.track_id: one.length_mm for one in estimates if one.length_mm is not None}
+
+
+def fish_table(out: Path) -> list[dict[str, str]]:
+    export, folder = Export(out, overwrite=True), out.parent / "exported"
+    with export.into(folder):
+        path = export.fish(folder, Config(), format="csv", all_columns=True)
+    return [*csv.DictReader(path.read_text().splitlines())]
 
 
 def test_each_fish_is_shown_and_exported_by_its_own_inputs(changed: Path, tmp_path: Path):
@@ -141,9 +150,13 @@ def test_verify_asks_no_length_of_an_added_fish_whose_settings_were_deleted(
     (row,) = ReviewQueue([report], reviewer="Ada").record(json.dumps(said).encode())["rows"]
     assert row["length_mm"] is not None
     assert verify(out)[0] == []
+    templates = [exported["template"] for exported in fish_table(out)]
+    assert templates == ["tiny", "tiny", "broad", "broad", "tiny"]
     for segment in out.glob("recording-000001.*"):
         segment.unlink()
     assert verify(out)[0] == []
+    templates = [exported["template"] for exported in fish_table(out)]
+    assert templates == ["unknown", "unknown", "broad", "broad", "unknown"]
 
 
 def test_a_replay_of_two_configs_is_refused_and_each_part_can_be_replayed(
