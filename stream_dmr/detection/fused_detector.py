@@ -18,7 +18,7 @@ from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.motion_detector import MotionDetector
-from stream_dmr.detection.picture_views import look_closer
+from stream_dmr.detection.picture_views import brightened, look_closer
 from stream_dmr.detection.still_water import StillWater
 from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
 from stream_dmr.messages import Frame
@@ -79,11 +79,11 @@ class FusedDetector:
 
     def find(self, frame: Frame) -> list[Candidate]:
         if self._must_look:
-            looking = self._beside.submit(self._looks.find, frame)
+            looking = self._beside.submit(self._look, frame)
             moving, seen = self._motion.find(frame), looking.result()
         else:  # spray and waves go on for a while, but nothing of a fish's size moves
             moving = self._motion.find(frame)
-            seen = self._looks.find(frame) if moving else []
+            seen = self._look(frame) if moving else []
         if self._must_look or moving:
             self._looked_ns = frame.timestamp_ns
         return [
@@ -95,7 +95,10 @@ class FusedDetector:
 
     def look_closer(self, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
         """Score from 0 to 1 of a box as a fish, from near."""
-        return look_closer(self._looks, frame, bbox_xyxy_px)
+        return look_closer(self._looks, brightened(frame), bbox_xyxy_px)
+
+    def _look(self, frame: Frame) -> list[Candidate]:
+        return self._looks.find(brightened(frame))
 
     def _place(self, candidate: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (candidate.bbox_xyxy_px[:2] + candidate.bbox_xyxy_px[2:]) / 2

@@ -19,6 +19,7 @@ from stream_dmr.detection.background_model import (
     warp,
 )
 from stream_dmr.detection.detector import Candidate
+from stream_dmr.detection.picture_views import brightening_power
 from stream_dmr.geometry import components, oriented_extent
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
@@ -204,6 +205,9 @@ _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
 _RATES = np.array([1] + [0.02] * 255, np.float32)
 _NEAR_THRESHOLD_RATIO = 0.65  # of the threshold, for pixels near pixels above it
 _NEAR_PX = 11  # diameter of "near"
+# By which the threshold falls where a power of 0 would brighten a picture; it is 0.5 or more.
+# Chosen on drawn films made dark; see docs/research/raw-video.md.
+_DARK_SHARE = 0.6
 _IDENTITY = np.eye(2, 3)
 
 
@@ -217,7 +221,10 @@ class MotionSettings(Settings):
         default=20.0, ge=2, description="frames over which the background is learnt"
     )
     motion_min_distance: float = Field(
-        default=5.0, gt=0, description="least distance of a fish's colours from the background, std"
+        default=5.0,
+        gt=0,
+        description="least distance of a fish's colours from the background, std; in the dark down "
+        "to 0.7 of it, since fish stand out less there, and waves too",
     )
     motion_min_length: float = Field(
         default=0.03, gt=0, le=1, description="shortest fish, as a fraction of the longer side"
@@ -287,7 +294,8 @@ class MotionDetector:
         picture = _planes(aligned)
         background.fill_unseen(picture)
         distance = background.distance(picture)
-        foreign = _find_foreign(distance, self._settings.motion_min_distance)
+        share = 1 - _DARK_SHARE * (1 - brightening_power(small))
+        foreign = _find_foreign(distance, share * self._settings.motion_min_distance)
         if background.is_young:
             foreign[background.uncover(picture, foreign)] = 0
         still = _find_still(foreign, aligned, self._before)

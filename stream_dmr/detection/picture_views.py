@@ -3,6 +3,7 @@
 And look closely at what was found: from near, other things look less like fish than from afar.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -35,6 +36,9 @@ _SHORTEST, _LEAST = 0.1, 0.05
 # Longer side of a view: a detector sees it smaller still, and a telephone's picture in full size
 # takes seconds to mirror and turn. See docs/research/start-and-memory.md.
 _MOST_PX = 2048
+# Median of a dark picture, of 1, and the least power that brightens it. Chosen on drawn films made
+# dark, and photographs; see docs/research/raw-video.md.
+_DARK, _LEAST_POWER = 0.3, 0.5
 
 
 def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
@@ -63,6 +67,25 @@ def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
             score = (candidate.score + same.score) / 2
             found.append(replace(candidate, bbox_xyxy_px=box, score=score))
     return [*found, *(replace(other, score=other.score / 2) for other in mirrored)]
+
+
+def brightening_power(image: UInt8[np.ndarray, "H W 3"]) -> float:
+    """The power, from 0.5 to 1, of levels from 0 to 1 that brightens a dark picture; 1 if bright.
+
+    It raises the median to 0.3, if it can.
+    """
+    grey = cv2.cvtColor(np.ascontiguousarray(image[::8, ::8]), cv2.COLOR_BGR2GRAY)
+    median = float(np.median(grey).clip(1, 254)) / 255
+    return min(max(math.log(_DARK) / math.log(median), _LEAST_POWER), 1.0)
+
+
+def brightened(frame: Frame) -> Frame:
+    """The frame with a dark picture brightened: fish are seen better in it."""
+    power = brightening_power(frame.image)
+    if power == 1:
+        return frame
+    levels = 255 * (np.arange(256) / 255) ** power
+    return replace(frame, image=cv2.LUT(frame.image, levels.round().astype(np.uint8)))
 
 
 def look_closer(detector: Detector, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.detection.fused_detector import FusedDetector, fuse
 from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
-from stream_dmr.detection.picture_views import look_closer
+from stream_dmr.detection.picture_views import brightened, look_closer
 from stream_dmr.geometry import fraction_inside
 from stream_dmr.messages import Frame
 from tests.support.frames import frame_of
@@ -63,6 +63,21 @@ def test_a_shape_that_moves_is_found_once():
     detector = FusedDetector(MotionDetector(MotionSettings()), both)
     found = [detector.find(frame(i)) for i in range(5)][-1]
     assert sorted(is_still(one) for one in found) == [False, True]
+
+
+@given(level=st.integers(0, 255))
+def test_only_dark_pictures_are_brightened(level: int):
+    ramp = np.linspace(0, 255, 320).astype(np.uint8)
+    image = np.full((240, 320, 3), level, np.uint8)
+    image[:80] = ramp[:, None]
+    shown = brightened(frame_of(image, 1)).image
+    assert level < 77 or np.array_equal(shown, image)  # 0.3 of 255
+    assert (shown >= image).all()
+    assert (np.diff(shown[0, :, 0].astype(int)) >= 0).all()
+    assert shown.min() == 0
+    assert shown.max() == 255
+    if 23 <= level < 77:  # the root is enough for these
+        assert abs(int(shown[-1, 0, 0]) - 0.3 * 255) <= 1
 
 
 class LargeAndBright:

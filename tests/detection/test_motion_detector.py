@@ -68,6 +68,20 @@ def test_what_stands_still_is_no_fish():
     assert not any(found[9:])  # and this is no picture that a recorder repeats
 
 
+@pytest.mark.parametrize(("level", "is_found"), [(20, True), (90, False)])
+def test_a_faint_fish_is_found_in_the_dark(level: int, is_found: bool):
+    rng, pictures = np.random.default_rng(1), list[np.ndarray]()
+    for i in range(60):
+        picture = np.full((240, 320, 3), level, np.uint8)
+        if i >= 30:
+            cv2.ellipse(picture, (10 * i - 280, 120), (30, 10), 20, 0, 360, (level + 14,) * 3, -1)
+        noisy = picture + rng.normal(0, 5, picture.shape)
+        pictures.append(noisy.clip(0, 255).astype(np.uint8))
+    found = find_all(pictures)
+    assert not any(found[:30])
+    assert (sum(map(bool, found[30:])) >= 25) == is_found
+
+
 def test_a_change_of_light_is_no_fish():
     wall = texture(3)[:240, :320].astype(float)
     lit = [np.clip(wall * gain, 0, 255).astype(np.uint8) for gain in np.linspace(0.8, 1.2, 20)]
