@@ -97,7 +97,7 @@ class FusedDetector:
         """Score from 0 to 1 of a box as a fish, from near."""
         return look_closer(self._looks, brightened(frame), bbox_xyxy_px)
 
-    def _look(self, frame: Frame) -> list[Candidate]:
+    def _look(self, frame: Frame) -> Sequence[Candidate]:
         return self._looks.find(brightened(frame))
 
     def _place(self, candidate: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
