@@ -117,12 +117,13 @@ class HaulLog:
             if not estimate.is_final:
                 return
             if self._pause_ns and self._ruled is None and self.current() is None:
-                self._ruled = next_name(self._known)
                 # From the first frame of any fish in view: it may have come before this fish. But
-                # a haul that people ended meanwhile keeps its end.
+                # a haul that people ended meanwhile keeps its end, and its fish.
                 ends = [haul.ended_ns or 0 for haul in self._known]
-                past = [end_ns for end_ns in ends if end_ns <= self._now_ns]
-                self._add(START, self._ruled, max([min(self._in_view.values()), *past]), _RULE)
+                past_ns = max((end_ns for end_ns in ends if end_ns <= self._now_ns), default=0)
+                if self._last_fish_ns > past_ns:
+                    self._ruled = next_name(self._known)
+                    self._add(START, self._ruled, max(min(self._in_view.values()), past_ns), _RULE)
             del self._in_view[estimate.track_id]
 
     def take_position(self, position: Position) -> None:

@@ -186,20 +186,19 @@ def test_a_rule_does_not_end_a_haul_that_a_command_began_during_its_own(tmp_path
 def test_a_rule_begins_no_haul_before_the_end_of_one_that_people_ended(tmp_path: Path):
     """A fish in view at that end belongs to A or to the haul of the rule, which comes after it."""
     store = LengthStore(tmp_path, FACTS)
-    log = HaulLog(store, HaulsSettings(pause_min=5.0))
+    log = HaulLog(store, HaulsSettings(pause_min=0.1))
     for second in range(0, 200, 10):
         log.take_frame(second * SECOND)
         if second in (0, 60):
             log.mark("start" if second == 0 else "end", "A", said_by="Ada")
-        if second in (70, 100):  # the first was in view from 50 to 52 s
-            log.take_fish(
-                fish(second, first_timestamp_ns=50 * SECOND, last_timestamp_ns=70 * SECOND)
-            )
+        if second in (70, 100):  # the end of the first came to light after that of the haul
+            last_ns = (58 if second == 70 else 90) * SECOND
+            log.take_fish(fish(second, first_timestamp_ns=50 * SECOND, last_timestamp_ns=last_ns))
         log.frame_done()
     first, second = log.hauls()
     store.close()
     assert (first.name, first.ended_ns) == ("A", 60 * SECOND)
-    assert (second.name, second.began_ns, second.ended_ns) == ("1", 60 * SECOND, None)
+    assert (second.name, second.began_ns, second.ended_ns) == ("1", 60 * SECOND, 90 * SECOND + 1)
 
 
 def test_a_command_without_a_time_means_the_frames_that_come_now(tmp_path: Path):
