@@ -222,10 +222,12 @@ def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
 def _now_ns(database: Path, wall_ns: int) -> int:
     """Now on the clock of the frames: that of a camera goes on evenly if this machine's is set."""
     marks = {row["name"]: row["value"] for row in read_rows(database, MARKS)}
-    last_ns = marks.get("timestamp_ns", 0)
-    if not last_ns or read_rows(database, CLIPS):  # clips may be measured long after they came
+    *_, run = read_runs(database).values()
+    if read_rows(database, CLIPS):  # clips may be measured long after they came
         return wall_ns
-    return min(max(wall_ns, last_ns), last_ns + MARK_EVERY_NS)
+    last_ns = marks.get("timestamp_ns", 0)
+    now_ns = max(wall_ns, last_ns)  # while no frame came, the mark is that of a run before
+    return min(now_ns, last_ns + MARK_EVERY_NS) if run.frames_done else now_ns
 
 
 def _seconds(at: str | None) -> float | None:
