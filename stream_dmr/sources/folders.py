@@ -203,6 +203,7 @@ class ClipFolder(Source):
         self._begun: set[str] = set()  # names of clips that were read, are being read or left out
         self._frames_done: dict[str, int] = {}
         self._read: dict[str, _FileState] = {}  # the clips when their reading began
+        self._own: set[str] = set()  # names that came beside others, not in their place
         self._rewritten: set[str] = set()  # names of clips that others replaced since
         self._after_ns = 0
         self._latest_ns = 0  # the latest end of a clip, by its file
@@ -298,7 +299,7 @@ class ClipFolder(Source):
     def _has_more(self, path: Path) -> bool:
         """True for a clip that was not read, or has grown since; names one that was replaced."""
         if path.name not in self._begun:
-            return not self._is_renamed(path)
+            return path.name in self._own or not self._is_renamed(path)
         state, before = _state_of(path), self._read.get(path.name)
         if state is None or before is None:
             return False
@@ -308,14 +309,16 @@ class ClipFolder(Source):
         return state.num_bytes > before.num_bytes
 
     def _is_renamed(self, path: Path) -> bool:
-        """True for a clip that was read by another name, which is gone; says so."""
+        """True for a new name of a clip that was read by one which is gone, or another's; says so."""
         state = _state_of(path)
         same = [name for name, read in self._read.items() if read == state]
-        before = next((name for name in same if not (self._folder / name).exists()), None)
+        before = next((name for name in same if _state_of(self._folder / name) != state), None)
         if state is None or before is None:
+            self._own.add(path.name)
             return False
         self._begun.add(path.name)
         self._read[path.name] = state
+        self._frames_done[path.name] = self._frames_done.get(before, 0)  # it may still grow
         self._mark_done(path.name)
         self._on_notice(f"{path.name}: is {before} by another name, so is not read again")
         return True
@@ -328,7 +331,7 @@ class ClipFolder(Source):
         days = (state.modified_ns - now_ns) / _DAY_NS
         self._on_notice(
             f"{path.name}: by its time of change it ends in {days:.1f} days, so its times are "
-            "those after the clip before it; set the recorder's clock"
+            "those after the clip before it; set the recorder's clock, or this machine's"
         )
         return 0 if self._latest_ns else now_ns
 

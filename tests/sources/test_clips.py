@@ -238,6 +238,21 @@ def test_a_clip_that_is_renamed_after_it_was_read_is_not_read_again(tmp_path: Pa
     assert numbers([*first, *frames]) == [1, 2, 3, 4, 2, 3, 4, 5]
     assert done == ["7.avi"]
     assert folder.warnings == ["7.avi: is 1.avi by another name, so is not read again"]
+    clip(tmp_path / "7.avi", first=1, num_frames=6)
+    assert numbers([*folder]) == [5, 6]
+
+
+def test_only_the_clip_that_was_read_is_not_read_by_another_name(tmp_path: Path):
+    """Its old name may be another's by now; another that is as large and old was there before."""
+    for number in (1, 2):
+        clip(tmp_path / f"{number}.avi", first=5)
+    folder = ClipFolder(tmp_path, AT_ONCE)
+    frames = iter(folder)
+    first = next(frames)
+    (tmp_path / "1.avi").rename(tmp_path / "7.avi")
+    clip(tmp_path / "1.avi", first=9)
+    assert numbers([first, *frames]) == [5, 6, 7, 8] * 2
+    assert folder.warnings[0] == "7.avi: is 1.avi by another name, so is not read again"
 
 
 def test_closing_ends_the_wait_for_a_clip(tmp_path: Path):
