@@ -128,10 +128,10 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
             "the file is damaged"
         )
     spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
-    if spread[2] < _MIN_THICKNESS * spread[0]:
+    if spread[-1] < _MIN_THICKNESS * spread[0]:  # two vertices have two
         raise TemplateError(
             f"template {path}: expected a body, got a flat mesh, of a thickness of "
-            f"{spread[2] / spread[0]:.1g} of its length; give it one, all axes in the same unit"
+            f"{spread[-1] / spread[0]:.1g} of its length; give it one, all axes in the same unit"
         )
     # Some formats repeat a vertex for each face, or along the seams of a texture.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)

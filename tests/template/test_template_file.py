@@ -130,6 +130,7 @@ class TestRefusals:
             (lambda: trimesh.Trimesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "empty"),
             (lambda: thin(1e-4), "expected a body, got a flat mesh"),
             (lambda: thin(0.0), "expected a body, got a flat mesh"),
+            (lambda: trimesh.Trimesh(np.eye(2, 3), [[0, 1, 1]], process=False), "got a flat mesh"),
             (lambda: trimesh.creation.box(fish_mesh().extents), "got none within 0.1 body lengths"),
         ],
     )
