@@ -146,7 +146,8 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
     require_unlocked(folder)
-    if remove_unfinished(folder):
+    # Killed while the new results took the place of the first ones, it may have these alone.
+    if (folder / NAME).exists() and remove_unfinished(folder):
         yield (
             f"{folder}: has the lengths by the mesh that was given, which the fish are not like: "
             "the run was killed while it measured them again; begin it anew"

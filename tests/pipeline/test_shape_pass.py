@@ -307,6 +307,10 @@ def test_a_stop_while_fish_are_measured_again_keeps_the_first_lengths(clip: Path
     assert line.endswith("the run was killed while it measured them again; begin it anew")
     assert not list(out.glob(".again*"))
     assert verify(out)[0] == []
+    whole = tmp_path / "killed" / ".again-1"  # after the first results were removed for these
+    whole.mkdir(parents=True)
+    assert list(recover_folder(whole.parent)) == []
+    assert whole.exists()
 
 
 def test_a_mesh_to_measure_with_is_not_replaced_by_what_is_learnt(clip: Path, tmp_path: Path):
