@@ -117,7 +117,7 @@ class PositionCounts:
     unreadable: int = 0
     without_fix: int = 0  # the receiver said itself that it had no position
     without_date: int = 0
-    jumps: int = 0  # further away than a vessel gets, or back in time
+    jumps: int = 0  # further away than a vessel gets, or back in time, or a jump of it
     roll_overs: int = 0  # dates 1024 weeks off, put right
     reconnects: int = 0
     last_arrival_ns: int = 0  # of any sentence, monotonic clock; 0: none so far
@@ -130,7 +130,7 @@ class PositionCounts:
             "unreadable": "unreadable",
             "without_fix": "without a position",
             "without_date": "without a date",
-            "jumps": "too far from the one before, or earlier",
+            "jumps": "too far from the one before, or of a time that jumps",
         }
         found = [(getattr(self, field.name), words.get(field.name)) for field in fields(self)]
         parts = [f"{count} {text}" for count, text in found if count and text]
