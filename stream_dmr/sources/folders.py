@@ -309,7 +309,7 @@ class ClipFolder(Source):
         return state.num_bytes > before.num_bytes
 
     def _is_renamed(self, path: Path) -> bool:
-        """True for a new name of a clip that was read by one which is gone, or another's; says so."""
+        """True for a new name of a clip that was read by one which is gone or reused; says so."""
         state = _state_of(path)
         same = [name for name, read in self._read.items() if read == state]
         before = next((name for name in same if _state_of(self._folder / name) != state), None)
