@@ -36,8 +36,8 @@ _SHORTEST, _LEAST = 0.1, 0.05
 # Longer side of a view: a detector sees it smaller still, and a telephone's picture in full size
 # takes seconds to mirror and turn. See docs/research/start-and-memory.md.
 _MOST_PX = 2048
-# Median of a dark picture, of 1, and the least power that brightens it. Chosen on drawn films made
-# dark, and photographs; see docs/research/raw-video.md.
+# Level of 1 that a quarter of a bright picture exceeds, and the least power that brightens a dark
+# one. Chosen on drawn films made dark, and photographs; see docs/research/raw-video.md.
 _DARK, _LEAST_POWER = 0.3, 0.5
 
 
@@ -72,11 +72,11 @@ def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
 def brightening_power(image: UInt8[np.ndarray, "H W 3"]) -> float:
     """The power, from 0.5 to 1, of levels from 0 to 1 that brightens a dark picture; 1 if bright.
 
-    It raises the median to 0.3, if it can.
+    It raises the upper quartile to 0.3, if it can: more than half of a dome's picture may be black.
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image[::8, ::8]), cv2.COLOR_BGR2GRAY)
-    median = float(np.median(grey).clip(1, 254)) / 255
-    return min(max(math.log(_DARK) / math.log(median), _LEAST_POWER), 1.0)
+    quartile = float(np.percentile(grey, 75).clip(1, 254)) / 255
+    return min(max(math.log(_DARK) / math.log(quartile), _LEAST_POWER), 1.0)
 
 
 def brightened(frame: Frame) -> Frame:

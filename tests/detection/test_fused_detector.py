@@ -69,7 +69,7 @@ def test_a_shape_that_moves_is_found_once():
 def test_only_dark_pictures_are_brightened(level: int):
     ramp = np.linspace(0, 255, 320).astype(np.uint8)
     image = np.full((240, 320, 3), level, np.uint8)
-    image[:80] = ramp[:, None]
+    image[:40] = ramp[:, None]
     shown = brightened(frame_of(image, 1)).image
     assert level < 77 or np.array_equal(shown, image)  # 0.3 of 255
     assert (shown >= image).all()
