@@ -202,32 +202,31 @@ def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
     seconds = _seconds(at)
     if seconds is not None:
         return round(seconds * 1e9)
-    zeros = [facts.utc_zero_ns for facts in read_runs(database).values()]
-    zero_ns = zeros[-1] if zeros else None
+    run = next(reversed(read_runs(database).values()), None)
     if at is None and not is_locked(folder):
         raise UserError(f"{folder}: no run goes on here; say when, with --at")
-    if zero_ns is None:
+    if run is None or run.utc_zero_ns is None:
         raise UserError(
             f"{folder}: its run does not know the time of day of its frames; give --at in seconds, "
             "as in lengths.csv"
         )
     if at is None:
-        return _now_ns(database, time.time_ns() - zero_ns)
+        wall_ns = time.time_ns() - run.utc_zero_ns
+        return _now_ns(database, wall_ns, has_frames=bool(run.frames_done))
     try:
-        return utc_ns_of(at) - zero_ns
+        return utc_ns_of(at) - run.utc_zero_ns
     except ValueError as error:
         raise UserError(f"--at: expected {error}") from error
 
 
-def _now_ns(database: Path, wall_ns: int) -> int:
+def _now_ns(database: Path, wall_ns: int, *, has_frames: bool) -> int:
     """Now on the clock of the frames: that of a camera goes on evenly if this machine's is set."""
-    marks = {row["name"]: row["value"] for row in read_rows(database, MARKS)}
-    *_, run = read_runs(database).values()
     if read_rows(database, CLIPS):  # clips may be measured long after they came
         return wall_ns
+    marks = {row["name"]: row["value"] for row in read_rows(database, MARKS)}
     last_ns = marks.get("timestamp_ns", 0)
     now_ns = max(wall_ns, last_ns)  # while no frame came, the mark is that of a run before
-    return min(now_ns, last_ns + MARK_EVERY_NS) if run.frames_done else now_ns
+    return min(now_ns, last_ns + MARK_EVERY_NS) if has_frames else now_ns
 
 
 def _seconds(at: str | None) -> float | None:

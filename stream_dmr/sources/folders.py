@@ -326,9 +326,11 @@ class ClipFolder(Source):
     def _ended_ns(self, path: Path) -> int:
         """When a clip ended, with its last write; 0 if unknown: it follows the clip before it."""
         state, now_ns = _state_of(path), time.time_ns()
-        if state is None or state.modified_ns <= now_ns + _DAY_NS:
-            return 0 if state is None else state.modified_ns
+        if state is None:
+            return 0
         days = (state.modified_ns - now_ns) / _DAY_NS
+        if days <= 1:
+            return state.modified_ns
         self._on_notice(
             f"{path.name}: by its time of change it ends in {days:.1f} days, so its times are "
             "those after the clip before it; set the recorder's clock, or this machine's"

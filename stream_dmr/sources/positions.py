@@ -271,11 +271,11 @@ class JumpGate:
         return True
 
     def _follows(self, before: tuple[Fix, int], now: tuple[Fix, int]) -> bool:
-        seconds, utc_s = (now[1] - before[1]) / 1e9, None
-        if before[0].utc_ns is not None and now[0].utc_ns is not None:
+        seconds = (now[1] - before[1]) / 1e9
+        if before[0].utc_ns is not None and now[0].utc_ns is not None:  # of a receiver
             utc_s = (now[0].utc_ns - before[0].utc_ns) / 1e9
-        if utc_s is not None and abs(utc_s - seconds) > _TIME_JUMP_S:  # of a receiver
-            return False
+            if abs(utc_s - seconds) > _TIME_JUMP_S:
+                return False
         reach_m = self._max_m_per_s * seconds + _NOISE_M
         return seconds >= 0 and distance_m(before[0], now[0]) <= reach_m
 

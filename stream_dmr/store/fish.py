@@ -210,10 +210,12 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
             known.sort(key=lambda pair: max(pair[0].first_frame, pair[1].estimate.first_frame))
             estimate = _with_catch(estimate_of(edited.row), known)
             began_ns = estimate.first_timestamp_ns
-            beside = [fish for _, fish in known[:1]] or sorted(  # an added fish: the nearest one
-                tracks.values(), key=lambda fish: abs(fish.estimate.first_timestamp_ns - began_ns)
+            beside = min(  # of its first frames; an added fish is of the run of the nearest one
+                [fish for _, fish in known[:1]] or tracks.values(),
+                key=lambda fish: abs(fish.estimate.first_timestamp_ns - began_ns),
+                default=None,
             )
-            run_id = beside[0].run_id if beside else [*runs][-1]  # that of its first frames
+            run_id = [*runs][-1] if beside is None else beside.run_id
             made[track_id] = fish(edited.row, estimate, run_id, origin=edited.kind)
     except (ValueError, KeyError) as error:
         raise OutputError(

@@ -183,16 +183,17 @@ def _prepare(request: TrainRequest) -> UNetTrainer:
         )
     init = request.init or (SHIPPED if request.images is not None else None)
     network = None if init is None else load_weights(init)
+    init_sha256 = "" if init is None else sha256_of(init)
     training = UNetTrainer(
         settings=request.settings,
         device=torch.device(request.device),
         out=make_folder(request.out),
         is_fine_tuning=init is not None,
-        init_sha256="" if init is None else sha256_of(init),
+        init_sha256=init_sha256,
     )
     if request.resume:
         training.resume()
-        if request.init is not None and sha256_of(request.init) != training.init_sha256:
+        if request.init is not None and init_sha256 != training.init_sha256:
             raise ModelError(
                 f"--init {request.init}: expected the weights that this training began with, got "
                 "others, which --resume would not use; give those, or another --out"

@@ -218,9 +218,9 @@ def measured_until(store: LengthStore, *, is_live: bool) -> Callable[[], int]:
     As capture times do, that of a camera goes on evenly from now, however the clock is set. Clips
     may be measured long after they were filmed.
     """
-    offset_ns = time.time_ns() - time.monotonic_ns()
     if not is_live:
         return lambda: store.last_ns
+    offset_ns = time.time_ns() - time.monotonic_ns()
     return lambda: max(store.last_ns, offset_ns + time.monotonic_ns())
 
 
