@@ -253,14 +253,13 @@ def add_verdict(
     path: Path,
     *verdicts: Verdict,
     frames: Sequence[AddedFrame] = (),
-    new_fish: int | None = None,
     known: int | None = None,
 ) -> Verdict:
     """Write verdicts into a lengths.db, durably, all or none; returns the last with its time.
 
-    `frames` are those of added fish, `new_fish` is the last track id that they use. With `known`,
-    the number of verdicts that they build on, UserError where another reviewer has written
-    meanwhile. Raises OutputError if the disk refuses it.
+    `frames` are those of added fish. With `known`, the number of verdicts that they build on,
+    UserError where another reviewer has written meanwhile. Raises OutputError if the disk refuses
+    it.
     """
     written = [replace(verdict, written_ns=time.time_ns()) for verdict in verdicts]
     try:
@@ -279,10 +278,11 @@ def add_verdict(
             )
         for verdict in written:
             database.execute(*insertion(VERDICTS, asdict(verdict)))
+            new_fish = {"add": verdict.track_id, "split": verdict.other_fish}.get(verdict.kind)
+            if new_fish is not None:
+                database.execute(MARK, (REVIEWED_ID, new_fish))  # no later run may use it
         for frame in frames:
             database.execute(*insertion(ADDED_FRAMES, asdict(frame)))
-        if new_fish is not None:
-            database.execute(MARK, (REVIEWED_ID, new_fish))  # no later run may use it
     return written[-1]
 
 

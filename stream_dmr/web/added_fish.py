@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,23 +124,14 @@ ADDED = "added by a reviewer"
 OTHER_PIXELS = "measured on pictures of the recording, which are not quite those of the run"
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackEdit:
-    """A verdict that changes which frames fish have, ready to be written."""
-
-    verdict: Verdict
-    frames: Sequence[AddedFrame] = ()
-    new_fish: int | None = None
-
-
 class TrackEditor:
-    """Makes edits of the tracks of a run, without writing them."""
+    """Makes verdicts that change which frames fish of a run have, without writing them."""
 
     def __init__(self, database: Path, pictures: FrameLookup) -> None:
         self._database = database
         self._pictures = pictures
 
-    def split(self, report: RunReport, verdict: Verdict) -> TrackEdit:
+    def split(self, report: RunReport, verdict: Verdict) -> Verdict:
         """Make a new fish of the frames from `verdict.frame_index` on.
 
         Raises UserError if a part has no frames.
@@ -157,10 +148,9 @@ class TrackEditor:
             )
         parts = report.edits.split(track_id, frame_index, new_fish)
         rows = self._rows(report, parts)
-        made = replace(verdict, other_fish=new_fish, fish=json.dumps(rows))
-        return TrackEdit(verdict=made, new_fish=new_fish)
+        return replace(verdict, other_fish=new_fish, fish=json.dumps(rows))
 
-    def merge(self, report: RunReport, verdict: Verdict) -> TrackEdit:
+    def merge(self, report: RunReport, verdict: Verdict) -> Verdict:
         """Make this fish part of `verdict.other_fish`. UserError if both are in view at once."""
         self._refuse_beside_a_run()
         other = verdict.other_fish
@@ -168,7 +158,7 @@ class TrackEditor:
         if other is None or other == verdict.track_id or other not in there:
             raise UserError(f"verdict: expected the number of another fish, got {other}")
         rows = self._rows(report, {other: report.edits.merge(verdict.track_id, other)})
-        return TrackEdit(verdict=replace(verdict, fish=json.dumps(rows)))
+        return replace(verdict, fish=json.dumps(rows))
 
     def require_free(
         self,
@@ -192,7 +182,7 @@ class TrackEditor:
 
     def add(
         self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
-    ) -> TrackEdit:
+    ) -> tuple[Verdict, list[AddedFrame]]:
         """Measure a missed fish in the drawn boxes; `time_ns`: times of the first and last box."""
         new_fish, part = self._new_fish(), part_at(report.recording, time_ns[0])
         found = list(self._pictures.frames((time_ns[0], time_ns[1] + 1)))
@@ -211,7 +201,7 @@ class TrackEditor:
         made = replace(
             verdict, track_id=new_fish, fish=json.dumps([row]), frames_sha256=frames_sha256(frames)
         )
-        return TrackEdit(verdict=made, frames=frames, new_fish=new_fish)
+        return made, frames
 
     def _rows(
         self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]

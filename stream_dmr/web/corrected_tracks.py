@@ -60,10 +60,8 @@ def import_tracks(report: RunReport, path: Path, *, reviewer: str) -> tuple[list
         frames = [
             frame for verdict in made if verdict.kind == "add" for frame in added[verdict.track_id]
         ]
-        new = [*added, *(verdict.other_fish or 0 for verdict in made if verdict.kind == "split")]
-        last = max(new, default=None)
     if made:
-        add_verdict(database, *made, frames=frames, new_fish=last, known=len(before))
+        add_verdict(database, *made, frames=frames, known=len(before))
         seal_verdicts(database.parent)
     return [f"fish {verdict.track_id}: {verdict.in_words}" for verdict in made], corrections.doubts
 

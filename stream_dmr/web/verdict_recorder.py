@@ -22,6 +22,7 @@ from stream_dmr.store.verdicts import (
     EDITS,
     NOT_COUNTED,
     NOT_REVIEWED,
+    AddedFrame,
     Ends,
     Review,
     Verdict,
@@ -33,7 +34,7 @@ from stream_dmr.store.verdicts import (
     reviews_of,
     standing,
 )
-from stream_dmr.web.added_fish import TrackEdit, TrackEditor, require_equal_lengths
+from stream_dmr.web.added_fish import TrackEditor, require_equal_lengths
 from stream_dmr.web.open_reports import reread_fish
 from stream_dmr.web.report_page import RunReport
 from stream_dmr.web.views import RecordedView, recorded_source
@@ -140,21 +141,17 @@ class VerdictRecorder:
             earlier = read_verdicts(self._database)
             self._follow(earlier)
             verdict = self._verdict(submitted)
+            frames: Sequence[AddedFrame] = ()
             if verdict.kind == "undo":
-                edit = TrackEdit(verdict=self._undo(verdict, earlier))
+                verdict = self._undo(verdict, earlier)
             else:
-                edit = self._checked(verdict, submitted, earlier)
+                verdict, frames = self._checked(verdict, submitted, earlier)
             is_edit, before = verdict.kind in (*EDITS, "undo"), self.report.edits
-            add_verdict(
-                self._database,
-                edit.verdict,
-                frames=edit.frames,
-                new_fish=edit.new_fish,
-                known=len(earlier) if is_edit else None,
-            )
+            known = len(earlier) if is_edit else None
+            add_verdict(self._database, verdict, frames=frames, known=known)
             seal_verdicts(self._database.parent)
             self._follow(read_verdicts(self._database))
-            return sorted({edit.verdict.track_id} | changed_fish(before, self.report.edits))
+            return sorted({verdict.track_id} | changed_fish(before, self.report.edits))
 
     def last(self) -> Verdict | None:
         """The verdict that an undo would take back; None if there is none."""
@@ -203,7 +200,8 @@ class VerdictRecorder:
 
     def _checked(
         self, verdict: Verdict, submitted: SubmittedVerdict, earlier: Sequence[Verdict]
-    ) -> TrackEdit:
+    ) -> tuple[Verdict, Sequence[AddedFrame]]:
+        """The verdict as it is written, and the frames of an added fish."""
         report = self.report
         if verdict.kind in EDITS and self._reading is not None:
             raise UserError(
@@ -228,16 +226,16 @@ class VerdictRecorder:
             _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
         match verdict.kind:
             case "split":
-                return self._editor.split(report, verdict)
+                verdict = self._editor.split(report, verdict)
             case "merge":
-                edit = self._editor.merge(report, verdict)
+                verdict = self._editor.merge(report, verdict)
                 require_equal_lengths(measured, verdict)
-                return edit
             case "correct":
                 moved = reviews.get(verdict.track_id, NOT_REVIEWED).moved
-                return TrackEdit(verdict=self._corrected(verdict, submitted, moved))
+                verdict = self._corrected(verdict, submitted, moved)
             case _:
-                return TrackEdit(verdict=verdict)
+                pass
+        return verdict, ()
 
     def _undo(self, verdict: Verdict, earlier: Sequence[Verdict]) -> Verdict:
         """Take back this reviewer's last verdict. UserError if later verdicts depend on it."""

@@ -164,7 +164,7 @@ def test_added_frames_come_back_and_their_fish_is_no_other(database: Path):
     ]
     verdict = replace(ACCEPT, kind="add", frames_sha256=frames_sha256(frames))
     assert next_track_id(database) == 1
-    add_verdict(database, verdict, frames=frames, new_fish=1)
+    add_verdict(database, verdict, frames=frames)
     assert read_added_frames(database) == {1: frames}
     assert next_track_id(database) == 2
     assert frames_sha256(frames[::-1]) != verdict.frames_sha256

@@ -10,7 +10,7 @@ import pytest
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.store.fish import Fish, read_stored_fish
-from stream_dmr.store.verdicts import read_verdicts
+from stream_dmr.store.verdicts import next_track_id, read_verdicts
 from stream_dmr.web.corrected_tracks import import_tracks
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.review_queue import ReviewQueue
@@ -125,6 +125,10 @@ def glove(rows: Rows) -> Rows:
     return [row for row in rows if row[0] == "2" and row[2] in "13"]
 
 
+def cod(rows: Rows) -> Rows:
+    return [[*row[:9], "Gadus morhua" if row[0] == "1" else "fish", *row[10:]] for row in rows]
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -165,9 +169,7 @@ def glove(rows: Rows) -> Rows:
             marks=pytest.mark.slow,
         ),
         (
-            lambda rows: [
-                [*row[:9], "Gadus morhua" if row[0] == "1" else "fish", *row[10:]] for row in rows
-            ],
+            cod,
             [{"kind": "species", "track_id": 1, "species": "Gadus morhua"}],
         ),
     ],
@@ -228,6 +230,11 @@ def test_a_fish_drawn_over_another_is_taken_and_said(out: Path):
     assert done.code == 0
     assert "of their area. Is it another fish?" in done.err
     assert fish_of(out)[3][:2] == (None, 1)
+    queue = ReviewQueue([open_report(out)], reviewer="Ada")
+    submit(queue, "split", 1, frame_index=3)  # as fish 4
+    queue.close()
+    assert take(out, corrected(out, cod)).code == 0
+    assert next_track_id(out / "lengths.db") == 5
 
 
 def test_moved_ends_are_a_correction(out: Path):
