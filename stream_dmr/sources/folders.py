@@ -1,7 +1,7 @@
 """Frames of folders: pictures, and clips that keep coming."""
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -179,6 +179,17 @@ class _FileState:
     modified_ns: int
 
 
+@dataclass(kw_only=True)
+class _Clip:
+    """A name in a folder of clips."""
+
+    is_begun: bool = False  # it was read, is being read or left out
+    state: _FileState | None = None  # when its reading began; None: not by this run
+    frames_done: int = 0
+    is_own: bool = False  # the name came beside others, not in their place
+    is_rewritten: bool = False  # another file has its name since
+
+
 class ClipFolder(Source):
     """The clips of a folder in natural order of their names, all of one size.
 
@@ -200,11 +211,7 @@ class ClipFolder(Source):
         self._settings = settings
         self._closing = Event()
         self._on_notice: Callable[[str], None] = self.warnings.append
-        self._begun: set[str] = set()  # names of clips that were read, are being read or left out
-        self._frames_done: dict[str, int] = {}
-        self._read: dict[str, _FileState] = {}  # the clips when their reading began
-        self._own: set[str] = set()  # names that came beside others, not in their place
-        self._rewritten: set[str] = set()  # names of clips that others replaced since
+        self._clips = defaultdict[str, _Clip](_Clip)  # by name
         self._after_ns = 0
         self._latest_ns = 0  # the latest end of a clip, by its file
         self._is_early = False  # the last clip came late, or after a wrong time
@@ -222,19 +229,22 @@ class ClipFolder(Source):
 
     def resume(self, point: ResumePoint) -> None:
         """Skip the clips and frames that were done, and begin after the last capture time."""
-        self._begun.update(point.clips_done)
-        self._frames_done = {**point.frames_done}
+        for name in point.clips_done:
+            self._clips[name].is_begun = True
+        for name, frames_done in point.frames_done.items():
+            self._clips[name].frames_done = frames_done
         self._after_ns = self._latest_ns = point.after_ns
         self._mark_done = point.mark_done
 
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
         while (path := self._next_clip()) is not None:
-            if path.name in self._read:
-                done = self._frames_done.get(path.name, 0)
+            clip = self._clips[path.name]
+            done = clip.frames_done
+            if clip.state is not None:
                 self._on_notice(f"{path.name}: grew after its {done} frames were read")
-            self._begun.add(path.name)
-            self._read[path.name] = _state_of(path) or _FileState(num_bytes=0, modified_ns=0)
+            clip.is_begun = True
+            clip.state = _state_of(path) or _FileState(num_bytes=0, modified_ns=0)
             self._video = self._open(path)
             if self._video is None:
                 continue
@@ -242,7 +252,6 @@ class ClipFolder(Source):
             ended_ns = self._ended_ns(path)
             start_ns = ended_ns - round(self._clip_s * 1e9)
             next_ns = last_ns + round(1e9 / self._video.fps)
-            done = self._frames_done.get(path.name, 0)
             for frame in self._whole_frames(self._video):
                 frame_index += 1
                 if frame.frame_index == done + 1:  # frames read before may lie before the last time
@@ -251,7 +260,7 @@ class ClipFolder(Source):
                     start_ns = max(start_ns, next_ns - frame.timestamp_ns)
                 last_ns = max(last_ns, start_ns + frame.timestamp_ns)
                 if frame.frame_index > done:
-                    self._frames_done[path.name] = frame.frame_index
+                    clip.frames_done = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             for line in self._video.warnings:
                 self._on_notice(line)
@@ -298,27 +307,32 @@ class ClipFolder(Source):
 
     def _has_more(self, path: Path) -> bool:
         """True for a clip that was not read, or has grown since; names one that was replaced."""
-        if path.name not in self._begun:
-            return path.name in self._own or not self._is_renamed(path)
-        state, before = _state_of(path), self._read.get(path.name)
+        clip = self._clips[path.name]
+        if not clip.is_begun:
+            return clip.is_own or not self._is_renamed(path)
+        state, before = _state_of(path), clip.state
         if state is None or before is None:
             return False
         later_s = (state.modified_ns - before.modified_ns) / 1e9
-        if state.num_bytes <= before.num_bytes and later_s > _SETTLE_S:
-            self._note_rewritten(path.name)
-        return state.num_bytes > before.num_bytes
+        is_longer = state.num_bytes > before.num_bytes
+        if not is_longer and later_s > _SETTLE_S and not clip.is_rewritten:
+            clip.is_rewritten = True
+            self._on_notice(
+                f"{path.name}: was written again after it was read, and is not read again: give "
+                "each clip a name of its own, such as its time"
+            )
+        return is_longer
 
     def _is_renamed(self, path: Path) -> bool:
         """True for a new name of a clip that was read by one which is gone or reused; says so."""
         state = _state_of(path)
-        same = [name for name, read in self._read.items() if read == state]
+        same = [name for name, clip in self._clips.items() if clip.state == state]
         before = next((name for name in same if _state_of(self._folder / name) != state), None)
         if state is None or before is None:
-            self._own.add(path.name)
+            self._clips[path.name].is_own = True
             return False
-        self._begun.add(path.name)
-        self._read[path.name] = state
-        self._frames_done[path.name] = self._frames_done.get(before, 0)  # it may still grow
+        done = self._clips[before].frames_done  # it may still grow
+        self._clips[path.name] = _Clip(is_begun=True, state=state, frames_done=done)
         self._mark_done(path.name)
         self._on_notice(f"{path.name}: is {before} by another name, so is not read again")
         return True
@@ -346,14 +360,6 @@ class ClipFolder(Source):
                 "before, and gets later times: it came late, or a clip before had a wrong time"
             )
         self._is_early = early_s > _MAX_EARLY_S
-
-    def _note_rewritten(self, name: str) -> None:
-        if name not in self._rewritten:
-            self._rewritten.add(name)
-            self._on_notice(
-                f"{name}: was written again after it was read, and is not read again: give each "
-                "clip a name of its own, such as its time"
-            )
 
     def _next_clip(self) -> Path | None:
         """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
