@@ -160,10 +160,6 @@ class RecordedView:
         """
         return self.row.estimate.is_frame_used, self.has_picture, self.row.fish.iou or 0.0
 
-    def decode(self, meshes: MeshRebuilder) -> tuple[FishCrop, FittedMesh]:
-        """The crop, and the fit with its vertices."""
-        return decode(FishCrop, self.crop), meshes.with_vertices(decode(FittedMesh, self.fit))
-
 
 @dataclass(kw_only=True)
 class RecordedTrack:
@@ -172,21 +168,13 @@ class RecordedTrack:
     rows: list[FishFrame] = field(default_factory=list[FishFrame])
     views: list[RecordedView] = field(default_factory=list[RecordedView])  # the best first
 
-    def add(self, row: FishFrame, view: RecordedView | None, *, max_views: int) -> None:
-        """Add a frame; keep its view if it is among the `max_views` best so far."""
-        self.rows.append(row)
-        if view is not None and row.fish.keypoints_px is not None:
-            self.views.append(view)
-            self.views.sort(key=lambda view: view.rank, reverse=True)
-            del self.views[max_views:]
-
 
 def read_tracks(reviewed: ReviewedMessages, *, max_views: int = 3) -> dict[int, RecordedTrack]:
     """Every fish with its `max_views` best views. Raises RecordingError.
 
     For fish that reviewers made, the running estimates are computed from their frames.
     """
-    tracks, edited = dict[int, RecordedTrack](), reviewed.estimates()
+    tracks, edited = defaultdict[int, RecordedTrack](RecordedTrack), reviewed.estimates()
     crops, fits = dict[_Key, tuple[bytes, bool]](), dict[_Key, bytes]()
     located = dict[_Key, LocalizedFish]()
     kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
@@ -206,12 +194,14 @@ def read_tracks(reviewed: ReviewedMessages, *, max_views: int = 3) -> dict[int, 
                 pass
         if estimate is None or (fish := located.pop(key, None)) is None:
             continue
-        row, view = FishFrame(fish=fish, estimate=estimate), None
+        row, track = FishFrame(fish=fish, estimate=estimate), tracks[fish.track_id]
+        track.rows.append(row)
         (crop, has_picture), fit = crops.pop(key, (None, False)), fits.pop(key, None)
-        if crop is not None and fit is not None:
+        if crop is not None and fit is not None and fish.keypoints_px is not None:
             view = RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture)
-        track = tracks.setdefault(fish.track_id, RecordedTrack())
-        track.add(row, view, max_views=max_views)
+            track.views.append(view)
+            track.views.sort(key=lambda view: view.rank, reverse=True)
+            del track.views[max_views:]
     return tracks
 
 
@@ -284,8 +274,8 @@ def _draw_view(
     template: Template,
     frame: UInt8[np.ndarray, "H W 3"] | None,
 ) -> DrawnView:
-    crop, fit = view.decode(meshes)
-    shape = fit.shape
+    crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
+    shape = meshes.with_vertices(fit).shape
     assert shape is not None  # a view has keypoints
     outlines = crop_outlines(crop, shape, template.faces)
     picture = crop_picture(crop, frame, size=_PICTURE_PX)
