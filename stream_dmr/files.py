@@ -257,6 +257,12 @@ def replacing(path: Path) -> Generator[Path]:
         raise
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Replace a text file in one step: readers get the old or the new text. Raises OutputError."""
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
 def make_folder(path: Path) -> Path:
     """Make a folder and its parents unless they exist. Raises OutputError."""
     with writing_to(path):

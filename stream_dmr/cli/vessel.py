@@ -138,12 +138,12 @@ def fleet(
     page's name. The page needs no server; with --every, Ctrl-C ends it.
     """
     from stream_dmr.evidence.own_files import is_made_by, require_writable
+    from stream_dmr.files import replace_text
     from stream_dmr.web.fleet_page import (
         ask_all,
         fleet_page,
         load_boxes,
         read_memory,
-        replace_text,
         write_memory,
     )
 

@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from stream_dmr.errors import ConfigError, OutputError, UserError, reason_of
 from stream_dmr.evidence.digest_file import read_digest
 from stream_dmr.evidence.own_files import is_made_by
-from stream_dmr.files import read_text, replacing
+from stream_dmr.files import read_text, replace_text
 from stream_dmr.store.ledger import load_public_key
 from stream_dmr.web.pages import render
 
@@ -338,12 +338,6 @@ def write_memory(path: Path, states: Iterable[BoxState]) -> None:
         if state.contact_ns is not None and state.reading is not None
     }
     replace_text(path, _Kept(boxes=kept).model_dump_json(indent=1))
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Replace a text file in one step: readers get the old or the new text. Raises OutputError."""
-    with replacing(path) as draft:
-        draft.write_text(text, encoding="utf-8", errors="backslashreplace")  # names of files
 
 
 def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:

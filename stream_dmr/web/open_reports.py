@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import add_files
-from stream_dmr.files import make_folder, replacing
+from stream_dmr.files import make_folder, replace_text
 from stream_dmr.pipeline.config import load_config, parse_config
 from stream_dmr.recording.frame_images import FrameLookup
 from stream_dmr.recording.reading import require_messages
@@ -157,7 +157,6 @@ def write_report(
     """
     make_folder(out.parent)
     page = render_page(reports, title=title, notes=notes, coast=coast)
-    with replacing(out) as draft:
-        draft.write_text(page, encoding="utf-8")
+    replace_text(out, page)
     add_files(out.parent, [out])
     return out.stat().st_size

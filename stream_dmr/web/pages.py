@@ -18,7 +18,8 @@ _ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": 
 
 def render(template: str, **values: object) -> Markup:
     """The HTML of a template, given by its path in this folder."""
-    return Markup(_ENVIRONMENT.get_template(template).render(values))
+    text = _ENVIRONMENT.get_template(template).render(values)
+    return Markup(text.encode(errors="backslashreplace").decode())  # names of files may be no UTF-8
 
 
 def _source(path: str) -> Markup:

@@ -7,10 +7,10 @@ from stream_dmr.web.pages import render
 EVIL = "</script><script>alert(1)</script>"
 
 
-def page(**data: Any) -> str:
+def page(title: str = EVIL, **data: Any) -> str:
     return render(
         "report/page.html",
-        title=EVIL,
+        title=title,
         trip="",
         data=data,
         details=[(1, data)],
@@ -27,3 +27,7 @@ def test_no_name_can_break_out_of_the_page():
 
 def test_scripts_stand_in_the_page_as_they_are():
     assert "=> { const input = document.getElementById(id);" in page()
+
+
+def test_a_name_that_is_no_utf_8_is_in_the_page_escaped():
+    assert r"r\udce9" in page("r\udce9").encode().decode()
