@@ -3,10 +3,9 @@
 import os
 import sys
 from collections import Counter
-from collections.abc import Generator
-from contextlib import closing, contextmanager
+from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,9 +13,6 @@ from stream_dmr.batch.manifest import COLUMNS, MORE_COLUMNS
 from stream_dmr.cli.shared_options import stop_on_signals, warn
 from stream_dmr.errors import UserError
 from stream_dmr.pipeline.run_options import ConfigOption, KeyOption, TemplateOption
-
-if TYPE_CHECKING:
-    from stream_dmr.batch.driver import Engine
 
 Engines = Literal["local", "ray"]
 
@@ -65,6 +61,7 @@ def batch(
             )
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch
+        from stream_dmr.batch.engines import LocalEngine, RayEngine
         from stream_dmr.batch.manifest import read_manifest, repeated_videos
         from stream_dmr.batch.measure_video import duration
         from stream_dmr.cli.terminal import counts_text
@@ -82,7 +79,11 @@ def batch(
             read_videos(out)  # refuses a table of no batch
         jobs = read_manifest(manifest, config=config, template=template, key=key)
         warn(repeated_videos(jobs))
-        with _engine(engine, workers, address, gpus) as opened:
+        with (
+            nullcontext(LocalEngine(workers or os.cpu_count() or 1))
+            if engine == "local"
+            else closing(RayEngine(address=address, gpus=gpus))
+        ) as opened:
             summary = run_batch(
                 jobs,
                 out,
@@ -102,16 +103,3 @@ def batch(
     stop.exit()
     if failed:
         raise typer.Exit(2)
-
-
-@contextmanager
-def _engine(name: str, workers: int, address: str | None, gpus: float) -> Generator["Engine"]:
-    if name == "local":
-        from stream_dmr.batch.engines import LocalEngine
-
-        yield LocalEngine(workers or os.cpu_count() or 1)
-        return
-    from stream_dmr.batch.engines import RayEngine
-
-    with closing(RayEngine(address=address, gpus=gpus)) as engine:
-        yield engine
