@@ -10,11 +10,13 @@ import sqlite3
 import stat
 import time
 from base64 import b64decode, b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
@@ -29,6 +31,7 @@ from stream_dmr.store.schema import CHECKS, LEDGER, Statement, insertion, record
 END, STATE, FILE, FOUND, REMOVED = "end", "state", "file", "found", "removed"
 FILE_KINDS = (FILE, FOUND, REMOVED)
 SIGNATURE_BYTES = 64  # of Ed25519
+K = TypeVar("K")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,23 +157,13 @@ def make_key(path: Path) -> Path:
 
 def load_public_key(path: Path) -> Ed25519PublicKey:
     """The public key of a device. Raises UserError if it is none."""
-    try:
-        key = serialization.load_pem_public_key(read_small(path))
-    except (OSError, ValueError) as error:
-        raise _no_key(path, "public", error) from error
-    if not isinstance(key, Ed25519PublicKey):
-        raise _no_key(path, "public", "a key of another kind")
-    return key
+    return _load_key(path, "public", Ed25519PublicKey, serialization.load_pem_public_key)
 
 
 def _load_private_key(path: Path) -> Ed25519PrivateKey:
-    try:
-        mode = path.stat().st_mode
-        key = serialization.load_pem_private_key(read_small(path), password=None)
-    except (OSError, ValueError, TypeError) as error:
-        raise _no_key(path, "private", error) from error
-    if not isinstance(key, Ed25519PrivateKey):
-        raise _no_key(path, "private", "a key of another kind")
+    load = partial(serialization.load_pem_private_key, password=None)
+    key = _load_key(path, "private", Ed25519PrivateKey, load)
+    mode = path.stat().st_mode
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise UserError(
             f"--key {path}: expected a private key that only its owner can read, got mode "
@@ -179,10 +172,16 @@ def _load_private_key(path: Path) -> Ed25519PrivateKey:
     return key
 
 
-def _no_key(path: Path, kind: str, error: object) -> UserError:
-    got = error.strerror if isinstance(error, OSError) else "something else"
-    return UserError(
-        f"--key {path}: expected the {kind} key of a device, got: {got}; make one with "
+def _load_key(path: Path, name: str, kind: type[K], load: Callable[[bytes], object]) -> K:
+    got: str | None = "something else"
+    try:
+        with suppress(ValueError, TypeError):
+            if isinstance(key := load(read_small(path)), kind):
+                return key
+    except OSError as error:
+        got = error.strerror
+    raise UserError(
+        f"--key {path}: expected the {name} key of a device, got: {got}; make one with "
         "stream-dmr keygen"
     )
 
