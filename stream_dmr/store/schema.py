@@ -194,17 +194,6 @@ def _declared() -> Mapping[str, tuple[str, _Columns]]:
         return {name: (statement, _columns(empty, name)) for name, statement in made}
 
 
-def ensure(database: sqlite3.Connection) -> None:
-    """Make the tables and columns that are missing, all of them or none.
-
-    Older programs read and write files that have more, so user_version stays.
-    """
-    if _missing(database):
-        with transaction(database):
-            for statement in _missing(database):
-                database.execute(statement)
-
-
 def _missing(database: sqlite3.Connection) -> list[str]:
     (version,) = database.execute("PRAGMA user_version").fetchone()
     statements = list[str]()
@@ -442,9 +431,16 @@ def _check(database: sqlite3.Connection, path: Path) -> None:
 
 
 def _prepare(database: sqlite3.Connection) -> None:
+    """Make the tables and columns that are missing, all of them or none.
+
+    Older programs read and write files that have more, so user_version stays.
+    """
     database.execute("PRAGMA journal_mode = WAL")
     database.execute("PRAGMA synchronous = FULL")
-    ensure(database)
+    if _missing(database):
+        with transaction(database):
+            for statement in _missing(database):
+                database.execute(statement)
 
 
 MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
