@@ -1,6 +1,5 @@
 """Compare readings of the same fish: decisions, species and lengths."""
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -94,12 +93,12 @@ def length_agreement(differences_mm: Sequence[float]) -> LengthAgreement:
     Bland and Altman, "Statistical methods for assessing agreement", The Lancet 327 (1986).
     """
     count = len(differences_mm)
-    if count == 0:
-        return LengthAgreement(count=0, mean_mm=None, limits_mm=None)
-    mean = fmean(differences_mm)
-    reach = 1.96 * stdev(differences_mm) if count > 1 else math.nan
-    limits = (mean - reach, mean + reach) if count > 1 else None
-    return LengthAgreement(count=count, mean_mm=mean, limits_mm=limits)
+    if count < 2:
+        return LengthAgreement(
+            count=count, mean_mm=next(iter(differences_mm), None), limits_mm=None
+        )
+    mean, reach = fmean(differences_mm), 1.96 * stdev(differences_mm)
+    return LengthAgreement(count=count, mean_mm=mean, limits_mm=(mean - reach, mean + reach))
 
 
 def agreements(folders: Sequence[Path]) -> list[ReadingPair]:
