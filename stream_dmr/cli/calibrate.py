@@ -21,7 +21,6 @@ from stream_dmr.errors import OutputError, UserError
 
 if TYPE_CHECKING:
     import numpy as np
-    from rich.console import Console
     from rich.table import Table
 
     from stream_dmr.calibration.board import BoardResult
@@ -72,8 +71,6 @@ def calibrate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Calibrate a camera and its reference plane from photographs of a board."""
-    from rich.console import Console
-
     from stream_dmr.calibration.corners import PrintedBoard
     from stream_dmr.evidence.own_files import require_writable
 
@@ -106,7 +103,6 @@ def calibrate(
         )
     require_writable(out, overwrite=overwrite)
     printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)
-    console = Console(file=sys.stdout, markup=False, emoji=False)  # names are shown as they are
     if lens is not None:
         _with_known_lens(lens, camera, plane=plane, board=printed, out=out)
         return
@@ -118,7 +114,6 @@ def calibrate(
         out=out,
         folder=corners or out.with_name(f"{out.stem}-corners"),
         overwrite=overwrite,
-        console=console,
     )
 
 
@@ -181,8 +176,8 @@ def _from_photographs(
     out: Path,
     folder: Path,
     overwrite: bool,
-    console: "Console",
 ) -> None:
+    from rich.console import Console
     from rich.progress import track
 
     from stream_dmr.calibration.board import calibrate as calibrate_camera
@@ -194,6 +189,7 @@ def _from_photographs(
             f"{folder}: expected an empty folder for the corners found, got one with files in it; "
             "choose another with --corners, or add --overwrite"
         )
+    console = Console(file=sys.stdout, markup=False, emoji=False)  # names are shown as they are
     result = calibrate_camera(
         track(images, "Looking for the board", console=console, transient=True),
         plane_image=plane,

@@ -7,16 +7,13 @@ import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, importing, stop_on_signals
 from stream_dmr.errors import OutputError
 from stream_dmr.pipeline.run_options import KeyOption, RunOptions
-
-if TYPE_CHECKING:
-    from stream_dmr.pipeline.measure_source import RunSummary
 
 
 def run(
@@ -41,32 +38,26 @@ def _measure(
     source = Path(options.source)
     with stop_on_signals() as stop, decoding_ahead(source) if source.is_file() else nullcontext():
         with importing():  # a second and a half
-            from stream_dmr.cli.terminal import RunDisplay
+            from stream_dmr.cli.terminal import RunDisplay, print_fish, print_speed, print_timings
             from stream_dmr.pipeline.measure_source import measure_source
             from stream_dmr.web.watch_observer import JsonLog, WatchObserver
 
         request = replace(options, command=command_line())
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:
             summary = measure_source(request, stop=stop, observer=WatchObserver(observer))
-        _print_measured(summary, timings=timings)
+        print_fish(summary.fish, summary.flags)
+        if timings:
+            print_timings(summary)
+        print_speed(summary)
+        if summary.calibration is not None:
+            distance_m = summary.calibration.plane.distance_mm / 1000
+            print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
         is_complete = truth is None or print_beside_truth(request.out / "lengths.csv", truth)
         # A camera's run continues after it has lost a file, and reports that.
         names = (path.name for path in summary.files if any(request.out.glob(path.name)))
         print(f"results in {request.out}: {', '.join(names)}")
     stop.exit()
     return is_complete
-
-
-def _print_measured(summary: "RunSummary", *, timings: bool) -> None:
-    from stream_dmr.cli.terminal import print_fish, print_speed, print_timings
-
-    print_fish(summary.fish, summary.flags)
-    if timings:
-        print_timings(summary)
-    print_speed(summary)
-    if summary.calibration is not None:
-        distance_m = summary.calibration.plane.distance_mm / 1000
-        print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
 
 
 def demo(

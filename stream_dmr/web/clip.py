@@ -79,19 +79,15 @@ def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dic
             fish, {"fish": fish, "mask": [], "points": [], "reason": ""}
         )
         if isinstance(message, FishCrop):
-            drawn["mask"] = _mask_lines(message)
+            cameras = {"crop_camera": message.crop_camera, "frame_camera": message.frame_camera}
+            lines = mask_outlines(message.mask, tolerance_px=0.7)  # in the end x, y, x, y, ...
+            in_frame = (np.round(frame_from_crop(line, **cameras), 1) for line in lines)
+            drawn["mask"] = [line.ravel().tolist() for line in in_frame]
         else:
             drawn["reason"] = message.reason
             if message.keypoints_px is not None:  # None: the fit was refused
                 drawn["points"] = np.round(message.keypoints_px, 1).tolist()
     return {frame: [by_fish[fish] for fish in sorted(by_fish)] for frame, by_fish in frames.items()}
-
-
-def _mask_lines(crop: FishCrop) -> list[list[float]]:
-    """The outer lines of a mask in frame pixels: x, y, x, y, ..."""
-    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
-    lines = mask_outlines(crop.mask, tolerance_px=0.7)
-    return [np.round(frame_from_crop(line, **cameras), 1).ravel().tolist() for line in lines]
 
 
 def _size(report: RunReport, image: UInt8[np.ndarray, "H W 3"]) -> list[int]:

@@ -223,7 +223,12 @@ class VerdictRecorder:
         there = {fish.estimate.track_id for fish in report.fish} - report.edits.merged.keys()
         check_verdict(verdict, there, reviews)
         if verdict.kind in EDITS:
-            _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
+            for number in (verdict.track_id, verdict.other_fish):
+                if number is not None and reviews.get(number, NOT_REVIEWED).moved:
+                    raise UserError(  # points hold only for the present frames of their fish
+                        f"verdict: expected a fish without moved points, but fish {number} has "
+                        "some; withdraw its verdicts first"
+                    )
         match verdict.kind:
             case "split":
                 verdict = self._editor.split(report, verdict)
@@ -298,13 +303,3 @@ class VerdictRecorder:
             if view.row.fish.frame_index == frame_index:
                 return view
         raise UserError(f"verdict: fish {track_id} is not shown in frame {frame_index}")
-
-
-def _require_unmoved(reviews: Mapping[int, Review], *fish: int | None) -> None:
-    """Raise UserError if a fish has moved points: they hold only for its present frames."""
-    for number in fish:
-        if number is not None and reviews.get(number, NOT_REVIEWED).moved:
-            raise UserError(
-                f"verdict: expected a fish without moved points, but fish {number} has some; "
-                "withdraw its verdicts first"
-            )

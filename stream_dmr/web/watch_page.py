@@ -51,17 +51,14 @@ def draw_fish(measured: MeasuredFrame) -> UInt8[np.ndarray, "H W 3"]:
             cv2.circle(drawn, point.tolist(), 4, colour, thickness=-1)
         length_mm = measured.lengths_mm.get(fish.track_id)
         text = f"{fish.track_id}" if length_mm is None else f"{fish.track_id}: {length_mm:.0f} mm"
-        _write_label(drawn, text, at=(int(points[0, 0]) + 8, int(points[0, 1])))
+        at = int(points[0, 0]) + 8, int(points[0, 1])
+        for colour, width in (((0, 0, 0), 6), ((255, 255, 255), 2)):
+            cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, width, cv2.LINE_AA)
     return drawn
 
 
 def encode_jpeg(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-
-
-def _write_label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int, int]) -> None:
-    for colour, thickness in (((0, 0, 0), 6), ((255, 255, 255), 2)):
-        cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, thickness, cv2.LINE_AA)
 
 
 _PICTURE_INTERVAL_S = 0.5  # requests within it get the same picture: measuring must stay fast
