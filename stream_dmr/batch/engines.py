@@ -67,7 +67,6 @@ class LocalEngine:
     def outcomes(
         self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
-        """See `Engine`."""
         waiting, finished = queue.Queue[Job](), queue.Queue[Outcome]()
         for job in jobs:
             waiting.put(job)
@@ -213,7 +212,6 @@ class RayEngine:
     def outcomes(
         self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
-        """See `Engine`."""
         waiting = {self._measure.remote(asdict(job), str(out.resolve())): job for job in jobs}
         while waiting:
             done, _ = self._ray.wait(list(waiting), timeout=_RAY_POLL_S)

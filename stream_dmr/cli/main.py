@@ -78,7 +78,6 @@ class _GroupedHelp(TyperGroup):
     """Lists the commands in groups by their purpose."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a list of commands for each group."""
         for title, commands in _GROUPS.items():
             names = [_name(command) for command in commands]
             rows = [(name, self.commands[name].short_help or "") for name in names]

@@ -127,7 +127,6 @@ def counts_text(names: Iterable[str | None]) -> str:
 
 
 def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> None:
-    """Print the fish of a replay, its speed and the folder of its results, to stdout."""
     print_fish(summary.fish)
     if timings:
         print_timings(summary)

@@ -306,7 +306,6 @@ class Export:
         return read_fish(self._path, self.recording, self._selection)
 
     def _template(self, fish: Fish) -> Template:
-        """The template by which a fish was measured."""
         return template_of_fish(self.recording, fish)
 
     @cached_property

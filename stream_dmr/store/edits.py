@@ -64,15 +64,12 @@ class TrackPart:
         return track_id == self.track_id and self.first_frame <= frame_index <= self.last_frame
 
     def before(self, frame_index: int) -> "TrackPart":
-        """The part before a frame; it may be empty."""
         return replace(self, last_frame=min(self.last_frame, frame_index - 1))
 
     def since(self, frame_index: int) -> "TrackPart":
-        """The part from a frame on; it may be empty."""
         return replace(self, first_frame=max(self.first_frame, frame_index))
 
     def overlaps(self, track: LengthEstimate) -> bool:
-        """True if it has frames of a whole track."""
         return self.first_frame <= track.last_frame and track.first_frame <= self.last_frame
 
     @property
@@ -138,7 +135,6 @@ class TrackEdits:
         }
 
     def merge(self, track_id: int, into: int) -> tuple[TrackPart, ...]:
-        """The parts of two fish that are one."""
         return (*self.parts_of(into), *self.parts_of(track_id))
 
 

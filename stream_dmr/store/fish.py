@@ -73,7 +73,6 @@ class Fish:
 
     @property
     def middle_ns(self) -> int:
-        """The capture time halfway between its first and its last frame."""
         return middle_ns(self.estimate)
 
     @property

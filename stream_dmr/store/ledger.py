@@ -57,7 +57,6 @@ class ChainEntry:
         return sha256(_canonical(asdict(self))).hexdigest()
 
     def is_signed_by(self, key: Ed25519PublicKey) -> bool:
-        """True if the signature is this key's, and of this entry."""
         try:
             return is_signature(key, b64decode(self.signature), self.signed_bytes)
         except ValueError:
@@ -88,7 +87,6 @@ class Signer:
         return self.content(kind, name, content_sha256(values)) if self._key else []
 
     def content(self, kind: str, name: str, sha256: str) -> list[Statement]:
-        """Sign anything by its hash."""
         return [insertion(LEDGER, asdict(self.sign(kind, name, sha256)))] if self._key else []
 
     def sign(self, kind: str, name: str, content_sha256: str) -> ChainEntry:
@@ -113,7 +111,6 @@ class Signer:
 
 
 def is_signature(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
-    """True for this key's signature of exactly these bytes."""
     try:
         key.verify(signature, data)
     except InvalidSignature:

@@ -338,7 +338,6 @@ class LengthStore:
         return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
-        """Write an event, a note to readers of the lengths."""
         self.append(EVENTS, kind, {"kind": kind, "text": text, "timestamp_ns": timestamp_ns})
 
     def append(

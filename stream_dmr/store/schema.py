@@ -187,7 +187,6 @@ SCENES = Table("scenes", order="calibration_sha256")
 
 @cache
 def _declared() -> Mapping[str, tuple[str, _Columns]]:
-    """SQL and columns of each table."""
     with closing(sqlite3.connect(":memory:")) as empty:
         empty.executescript(_SQL)
         made = empty.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()

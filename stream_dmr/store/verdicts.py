@@ -69,7 +69,6 @@ class Verdict:
 
     @property
     def in_words(self) -> str:
-        """The decision in words, for the reviewer."""
         return {
             "accept": "accepted",
             "reject": f"rejected, {self.reason}",

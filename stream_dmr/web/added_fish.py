@@ -206,7 +206,6 @@ class TrackEditor:
     def _rows(
         self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]
     ) -> list[dict[str, Any]]:
-        """The final row of each fish."""
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
         measured = [caught.estimate for caught in read_measured_fish(self._database)]
         last = {estimate.track_id: estimate.last_frame for estimate in measured}

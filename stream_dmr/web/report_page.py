@@ -234,7 +234,6 @@ class PlacedReport:
     shift_s: float  # added to capture times, so that the times of videos don't overlap
 
     def row_id(self, track_id: int) -> int:
-        """The number of a fish in the page."""
         return self.run * _MAX_TRACKS + track_id
 
     def row(self, fish: Fish) -> dict[str, Any]:

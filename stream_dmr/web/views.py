@@ -48,7 +48,6 @@ class Outlines:
 
 
 def crop_outlines(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 3"]) -> Outlines:
-    """The outlines of the mask and of the fitted mesh, and the keypoints."""
     keypoints = crop_from_frame(
         shape.keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
     )
@@ -89,7 +88,6 @@ def crop_picture(
 def draw_outlines(
     picture: UInt8[np.ndarray, "N N 3"], outlines: Outlines, *, crop_size: int
 ) -> UInt8[np.ndarray, "N N 3"]:
-    """The picture with mask, mesh and keypoints drawn over it."""
     image, scale = picture.copy(), picture.shape[0] / crop_size
 
     def to_picture(points: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:

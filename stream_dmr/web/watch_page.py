@@ -95,7 +95,6 @@ class WatchServer(TokenServer):
         return json_response(health, code)
 
     def _haul(self, request: Request) -> Response:
-        """Begin or end a haul."""
         if self._state.hauls is None:
             raise UserError("expected a run that takes hauls")
         submitted = None
