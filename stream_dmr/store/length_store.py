@@ -324,7 +324,8 @@ class LengthStore:
 
     def keep_scene(self, data: bytes) -> None:
         key = self._facts.calibration_sha256
-        self._write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
+        with self._lock:
+            self._rows.write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
 
     def first_ious(self, count: int) -> list[float]:
         """The IoU of the first `count` fish here with this run's calibration and template."""
@@ -357,7 +358,7 @@ class LengthStore:
     def sign_file(self, kind: str, name: str, sha256: str) -> None:
         """Sign a file of the folder by its hash, durably; nothing without a signer."""
         with self._lock:
-            self._write(*self._signer.content(kind, name, sha256))
+            self._rows.write(*self._signer.content(kind, name, sha256))
 
     def signed_files(self) -> set[str]:
         """The names of all files that were ever signed here."""
@@ -399,9 +400,9 @@ class LengthStore:
         values = {"ended_ns": time.time_ns()}
         values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
         with self._lock:
-            self._write(*self._signed_state())
+            self._rows.write(*self._signed_state())
             signature = self._signer.row(END, self.run_id, {"run_id": self.run_id} | values)
-            self._write((_END, (*values.values(), self.run_id)), *signature)
+            self._rows.write((_END, (*values.values(), self.run_id)), *signature)
         self._rows.close()
         self._reserve.release()
         self._lock_of_folder.release()
@@ -443,10 +444,6 @@ class LengthStore:
             higher = {n: max(v, getattr(self._used, n)) for n, v in marks.items()}
             self._used = replace(self._used, **higher)
             self._rows.write()
-
-    def _write(self, *statements: Statement) -> None:
-        with self._lock:
-            self._rows.write(*statements)
 
     def _state(self) -> Iterator[Statement]:
         """Statements that every commit adds: the present clip, frames done, used numbers."""
