@@ -145,6 +145,10 @@ _MIN_SURE_LOOKS, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
 # alone, since the network for masks loses a thin fish in a wider box.
 _MIN_MOTION = 0.25
 _FAR = 0.5
+# A track that may not count is cut out in its first frames, then in every few: in a film that pans
+# past rock most crops were of rock. No fish waits for so long in most films; see docs/research/
+# tracking.md.
+_ALWAYS_CUT_OUT, _CUT_OUT_EVERY = 8, 4
 # Share of how far the camera has moved: what is nearer or farther than the scene at large drifts by
 # so much in it. Without it 10 instead of 5 things count in a film that pans past rock.
 _PARALLAX = 0.5
@@ -159,11 +163,13 @@ class FishEvidence:
         self._first_offset_px = _camera_offset_px(candidate)
         self._need_not_move = candidate.place_px is None  # somebody found it
         self._motion = 0.0
+        self._frames = 0
         self._judged_frames = self._sure_frames = 0
         self.closer_looks = self._fish_like_closer = 0  # how many there were, and of a fish
         self.add(candidate, size_px)
 
     def add(self, candidate: Candidate, size_px: float) -> None:
+        self._frames += 1
         edges_px = _edges_px(candidate)
         if edges_px is not None and self._first_edges_px is not None:
             is_outlined = candidate.foreground is not None
@@ -188,6 +194,11 @@ class FishEvidence:
         """
         frames = 2**self.closer_looks - 1
         return self.closer_looks < _MAX_CLOSER_LOOKS and self._judged_frames >= frames
+
+    @property
+    def is_due(self) -> bool:
+        """True if it is cut out in this frame even if it may not count."""
+        return self._frames <= _ALWAYS_CUT_OUT or self._frames % _CUT_OUT_EVERY == 0
 
     @property
     def has_moved(self) -> bool:

@@ -203,6 +203,13 @@ class TrackedFish:
         self._look_closer(frame, boxes)
         self._seen.any_moved |= any(track.has_moved for track in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
+        due = {
+            track: box
+            for track, box in boxes.items()
+            if self._evidence[track].is_due
+            or self._may_count(track)
+            or self._confirmation.is_confirmed(track)
+        }
         # Boxes of given masks are not corrected, since these have no confidence.
         masks = {fish.track_number: fish.candidate.foreground for fish in tracked}
         return [
@@ -212,7 +219,7 @@ class TrackedFish:
                 mask_corner=whole_pixels(boxes[detection.source_id])[:2],
                 may_be_no_fish=not self._is_surely_fish(detection.source_id),
             )
-            for detection in self._corrector.correct(boxes, visible, frame)
+            for detection in self._corrector.correct(due, visible, frame)
         ]
 
     def _passes_over(self, frame: Frame) -> bool:

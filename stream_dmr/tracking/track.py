@@ -224,7 +224,8 @@ class Track:
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         """The fraction of this fish's predicted box that lies inside `box`."""
-        return fraction_inside(self._whole.box + np.tile(self._predicted_offset, 2), box)
+        predicted = (self._whole.box.reshape(2, 2) + self._predicted_offset).ravel()
+        return fraction_inside(predicted, box)
 
     def predicted_silhouette(self) -> PredictedSilhouette | None:
         """The last separate silhouette at its predicted position; None from boxes alone."""

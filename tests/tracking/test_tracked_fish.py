@@ -242,15 +242,23 @@ class NoDetector:
         return []
 
 
-@pytest.mark.parametrize(("looks", "counts", "num_looks"), [(0.8, True, 2), (0.0, False, 5)])
-def test_what_moves_is_looked_at_closely_a_few_times(looks: float, counts: bool, num_looks: int):
+@pytest.mark.parametrize(
+    ("looks", "counts", "num_looks", "not_cut_out"), [(0.8, True, 2, []), (0.0, False, 5, [12, 13, 14, 16, 17, 18, 20])]
+)
+def test_what_moves_is_looked_at_closely_a_few_times_and_seldom_cut_out_if_it_is_no_fish(
+    looks: float, counts: bool, num_looks: int, not_cut_out: list[int]
+):
     detector = BlindFromAfar(looks)
     fish = TrackedFish(detector, TrackFishSettings())
     confirmed: list[int] = []
+    cut: list[int] = []
     for index in range(1, 21):
         image = np.full((240, 320, 3), 60, np.uint8)
         image[100:130, 20 + 8 * index : 80 + 8 * index] = 220
         frame = frame_of(image, index)
-        confirmed += fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
+        found = fish.detect(frame)
+        cut += [index] * len(found)
+        confirmed += fish.confirm(cut_out(frame, found, WholeBox(1.0)))
     assert bool(confirmed) == counts
     assert detector.num_looks == num_looks
+    assert [i for i in range(cut[0], 21) if i not in cut] == not_cut_out
