@@ -145,9 +145,9 @@ _MIN_SURE_LOOKS, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
 # alone, since the network for masks loses a thin fish in a wider box.
 _MIN_MOTION = 0.25
 _FAR = 0.5
-# A track that may not count is cut out in its first frames, then in every few: in a film that pans
-# past rock most crops were of rock. No fish waits for so long in most films; see docs/research/
-# tracking.md.
+# A track that may not count is cut out in its first frames and then in one of so many: half of the
+# crops of an aquarium were of rock. Simulated fish may count by then; chosen, see
+# docs/research/tracking.md.
 _ALWAYS_CUT_OUT, _CUT_OUT_EVERY = 8, 4
 # Share of how far the camera has moved: what is nearer or farther than the scene at large drifts by
 # so much in it. Without it 10 instead of 5 things count in a film that pans past rock.
