@@ -243,7 +243,8 @@ class NoDetector:
 
 
 @pytest.mark.parametrize(
-    ("looks", "counts", "num_looks", "not_cut_out"), [(0.8, True, 2, []), (0.0, False, 5, [12, 13, 14, 16, 17, 18, 20])]
+    ("looks", "counts", "num_looks", "not_cut_out"),
+    [(0.8, True, 2, []), (0.0, False, 5, [12, 13, 14, 16, 17, 18, 20])],
 )
 def test_what_moves_is_looked_at_closely_a_few_times_and_seldom_cut_out_if_it_is_no_fish(
     looks: float, counts: bool, num_looks: int, not_cut_out: list[int]
