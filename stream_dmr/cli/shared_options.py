@@ -177,14 +177,17 @@ def importing() -> Generator[None]:
 
 @contextmanager
 def exit_on_signals() -> Generator[None]:
-    """End the block by SystemExit at the first Ctrl-C or SIGTERM alone, so that it cleans up."""
+    """End the block by SystemExit at Ctrl-C or SIGTERM; further ones don't disturb its cleaning up.
+
+    Libraries may swallow the exception, or turn it into another, such as while they are imported.
+    """
     number_of_first = 0
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal number_of_first
-        if not number_of_first:
-            number_of_first = number
-            raise SystemExit(128 + number)
+        number_of_first = number_of_first or number
+        if not isinstance(sys.exception(), SystemExit):
+            raise SystemExit(128 + number_of_first)
 
     try:
         with _handling_signals(on_signal):
@@ -192,6 +195,7 @@ def exit_on_signals() -> Generator[None]:
     finally:
         if number_of_first:
             print(f"stopped by {_name(number_of_first)}", file=sys.stderr)
+            raise SystemExit(128 + number_of_first)
 
 
 @contextmanager

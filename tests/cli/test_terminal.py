@@ -7,7 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.cli.shared_options import command_line, parse_selection, stop_on_signals
+from stream_dmr.cli.main import exit_codes
+from stream_dmr.cli.shared_options import (
+    command_line,
+    exit_on_signals,
+    parse_selection,
+    stop_on_signals,
+)
 from stream_dmr.cli.terminal import (
     RunDisplay,
     interval_text,
@@ -167,3 +173,21 @@ def test_a_signal_sets_the_event_and_is_remembered():
         os.kill(os.getpid(), signal.SIGINT)
     assert stop.signal_number == signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_signal_that_a_library_swallowed_still_ends_the_command():
+    heard = list[int]()
+
+    def command() -> None:
+        with exit_codes(), exit_on_signals():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                try:
+                    os.kill(os.getpid(), number)
+                except SystemExit:
+                    heard.append(number)
+            raise ImportError("as pybind11 makes of it")
+
+    with pytest.raises(SystemExit) as ended:
+        command()
+    assert heard == [signal.SIGTERM, signal.SIGINT]
+    assert ended.value.code == 128 + signal.SIGTERM
