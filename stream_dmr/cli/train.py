@@ -64,7 +64,7 @@ def train(
             best = train_unet(request, stop=stop, observer=display)
     if best is not None:
         print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.onnx'}")
-    stop.exit("; --resume continues")
+    stop.exit("; --resume continues" if (out / "last.pt").exists() else "; nothing was trained yet")
 
 
 _NOT_THE_SAME_IDS = (

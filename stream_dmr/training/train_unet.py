@@ -124,6 +124,10 @@ class TrainRequest:
     command: str = ""  # as typed, for scores.json
 
 
+class _StoppedError(Exception):
+    """`stop` was set while fish and backgrounds were simulated."""
+
+
 class TrainObserver:
     """Receives the progress of a training; the base class ignores it."""
 
@@ -150,7 +154,10 @@ def train_unet(
     """
     observer = observer or TrainObserver()
     training = _prepare(request)
-    draw, draw_validation = _sources(request, observer)
+    try:
+        draw, draw_validation = _sources(request, observer, stop)
+    except _StoppedError:
+        return max(training.history, key=lambda scores: scores.iou, default=None)
     validation = SampleDataset(
         draw_validation,
         size=request.settings.validation_crops,
@@ -203,13 +210,16 @@ def _prepare(request: TrainRequest) -> UNetTrainer:
     return training
 
 
-def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw]:
+def _sources(
+    request: TrainRequest, observer: TrainObserver, stop: threading.Event
+) -> tuple[Draw, Draw]:
     """The functions that draw training and validation examples; worker processes unpickle them."""
     if request.images is None or request.masks is None:
-        simulated = partial(draw_sample, bank=_bank(request, observer))
-        return simulated, partial(draw_sample, bank=_bank(request, observer, is_validation=True))
+        simulated = partial(draw_sample, bank=_bank(request, observer, stop))
+        validation_bank = _bank(request, observer, stop, is_validation=True)
+        return simulated, partial(draw_sample, bank=validation_bank)
     training, validation = load_fish_cutouts(request.images, request.masks)
-    bank = _bank(request, observer).with_photographs(
+    bank = _bank(request, observer, stop).with_photographs(
         [cutout_patch(cutout) for cutout in training],
         load_backgrounds(request.backgrounds) if request.backgrounds is not None else [],
     )
@@ -219,19 +229,29 @@ def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw
 
 
 def _bank(
-    request: TrainRequest, observer: TrainObserver, *, is_validation: bool = False
+    request: TrainRequest,
+    observer: TrainObserver,
+    stop: threading.Event,
+    *,
+    is_validation: bool = False,
 ) -> PatchBank:
     settings = request.settings
     divisor = _VALIDATION_BANK_DIVISOR if is_validation else 1
     num_fish = max(1, settings.bank_fish // divisor)
     num_backgrounds = max(1, settings.bank_backgrounds // divisor)
     done = count(1)
+
+    def progress() -> None:
+        if stop.is_set():
+            raise _StoppedError
+        observer.patches_drawn(next(done), num_fish + num_backgrounds)
+
     return load_or_make_bank(
         request.out / "cache",
         num_fish=num_fish,
         num_backgrounds=num_backgrounds,
         seed=settings.seed + is_validation,
-        progress=lambda: observer.patches_drawn(next(done), num_fish + num_backgrounds),
+        progress=progress,
     )
 
 

@@ -56,10 +56,23 @@ def test_a_training_writes_weights_scores_and_pictures(trained):
 
 class StopAfterFirst(TrainObserver):
     def __init__(self):
-        self.stop = threading.Event()
+        self.stop, self.num_drawn = threading.Event(), 0
 
     def epoch_done(self, scores, *, is_best):
         self.stop.set()
+
+
+class StopAtFirstPatch(StopAfterFirst):
+    def patches_drawn(self, num_done, num_all):
+        self.num_drawn += 1
+        self.stop.set()
+
+
+def test_a_training_is_stopped_while_its_fish_are_simulated(tmp_path):
+    observer = StopAtFirstPatch()
+    assert train_unet(request(tmp_path), stop=observer.stop, observer=observer) is None
+    assert observer.num_drawn == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(trained, tmp_path):
