@@ -159,7 +159,7 @@ _OPENER = urllib.request.build_opener(_NoRedirects)
 def _services(file: str) -> Iterator[Callable[[Alert], None]]:
     """A delivery for each address of the file. No message contains an address or its password."""
     with requires_extra("alerts", "[alerts] apprise_file"):
-        from apprise import Apprise, NotifyFormat, NotifyType
+        from apprise import Apprise, AppriseAsset, NotifyFormat, NotifyType
     where = "[alerts] apprise_file"
     text = read_secret(Path(file), where=where, what="an address of apprise a line")
 
@@ -176,8 +176,10 @@ def _services(file: str) -> Iterator[Callable[[Alert], None]]:
     addresses = {number: line for number, line in lines if line and not line.startswith("#")}
     if not addresses:
         raise ConfigError(f"{where} {file}: expected an address of apprise a line, got none")
+    asset = AppriseAsset()
+    asset.http_redirects = False  # a redirected POST arrives as a GET without the alert, as a 200
     for number, address in addresses.items():
-        services, line = Apprise(), f"{where} {file}, line {number}"
+        services, line = Apprise(asset=asset), f"{where} {file}, line {number}"
         if not services.add(address):
             raise ConfigError(
                 f"{line}: expected an address that apprise knows, such as "

@@ -356,12 +356,17 @@ class _Rude(_Handler):
         b"HTTP/1.0 301 Moved\r\nLocation: /elsewhere\r\nContent-Length: 0\r\n\r\n",
     ],
 )
-def test_an_alert_that_a_strange_answer_swallows_is_sent_again(answer: bytes):
+@pytest.mark.parametrize("by_apprise", [False, True])
+def test_an_alert_that_a_strange_answer_swallows_is_sent_again(
+    answer: bytes, by_apprise: bool, apprise_file: Callable[..., AlertSettings]
+):
     notices: list[str] = []
     with serving(Webhook()) as webhook:
         webhook.RequestHandlerClass = type("Rude", (_Rude,), {"answer": answer})
-        with watching(AlertSettings(webhook=webhook.address), ["no picture"], notices):
-            assert webhook.received.get(timeout=WAIT_S)["problems"] == ["no picture"]
+        by_webhook = AlertSettings(webhook=webhook.address)
+        settings = apprise_file(service_of(webhook)) if by_apprise else by_webhook
+        with watching(settings, ["no picture"], notices):
+            assert "no picture" in str(webhook.received.get(timeout=WAIT_S))
     assert len(notices) == 1
 
 
