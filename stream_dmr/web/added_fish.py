@@ -1,7 +1,7 @@
 """Add, split and merge fish for a reviewer; added fish are measured."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,7 +204,7 @@ class TrackEditor:
         return made, frames
 
     def _rows(
-        self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]
+        self, report: RunReport, parts: Mapping[int, Sequence[TrackPart]]
     ) -> list[dict[str, Any]]:
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
         measured = [caught.estimate for caught in read_measured_fish(self._database)]
@@ -213,6 +213,13 @@ class TrackEditor:
         flags = {caught.estimate.track_id: caught.flags for caught in report.fish}
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
+            for part in of_fish:
+                if not frames_of_parts(frames, [part], fish=fish):
+                    raise UserError(
+                        f"verdict: expected frames of fish {part.track_id} in the recording, found "
+                        "none: its segment is gone, as after a disk that ran short; the fish can "
+                        "only be accepted, rejected or a duplicate"
+                    )
             chosen = frames_of_parts(frames, of_fish, fish=fish)
             known = [*flags.get(fish, ())]
             known += [flag for part in of_fish for flag in flags.get(part.track_id, ())]

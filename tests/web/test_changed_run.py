@@ -159,6 +159,24 @@ def test_verify_asks_no_length_of_an_added_fish_whose_settings_were_deleted(
     assert templates == ["unknown", "unknown", "broad", "broad", "unknown"]
 
 
+@pytest.mark.parametrize("is_split", [True, False])
+def test_a_fish_whose_frames_were_deleted_is_neither_split_nor_merged(
+    changed: Path, tmp_path: Path, is_split: bool
+):
+    out = Path(shutil.copytree(changed, tmp_path / "out"))
+    _, gone, *_, other = sorted(lengths(out))
+    split = {"kind": "split", "track_id": gone, "frame_index": 3}
+    said = (
+        split
+        if is_split
+        else {"kind": "merge", "track_id": gone, "other_fish": other, "sure": True}
+    )
+    for segment in out.glob("recording-000001.*"):
+        segment.unlink()
+    with pytest.raises(UserError, match=f"expected frames of fish {gone} in the recording"):
+        ReviewQueue([open_report(out)], reviewer="Ada").record(json.dumps(said).encode())
+
+
 def test_a_replay_of_two_configs_is_refused_and_each_part_can_be_replayed(
     changed: Path, tmp_path: Path
 ):
