@@ -321,7 +321,7 @@ class RotatingSink:
         if self._frames_lost:
             self._files.on_notice(
                 f"at least {self._frames_lost} frames are in no recording, since the disk refused "
-                "them; their fish are in lengths.db"
+                "them, and can't be replayed"
             )
             self._frames_lost = 0
 

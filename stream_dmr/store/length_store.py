@@ -411,7 +411,8 @@ class LengthStore:
         if self.trouble:
             raise OutputError(
                 f"{self.path}: expected room for {len(self._rows.pending)} more rows, got: "
-                f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
+                f"{self.trouble}; keep a copy of lengths.csv, make room and run stream-dmr "
+                "recover, which takes over the fish that the disk let into the recording"
             )
 
     def _signed_state(self) -> list[Statement]:
