@@ -164,10 +164,10 @@ def _no_calibration(path: Path, got: str) -> CalibrationError:
 _GRID = 41  # places along each side of the picture
 _MAX_ROUND_TRIP_PX = 1.0
 _STEP = 1e-5  # of X and Y, for derivatives
-# Chosen: corners without a board may be folded, since polynomials are free there; a port of
-# flat glass under water enlarges small areas 40 degrees off the axis by 5.
-_MAX_SHARE = 0.05
-_MAX_ENLARGEMENT = 6.0
+_MAX_SHARE = 0.05  # chosen: corners without a board may be folded, since polynomials are free there
+# Chosen. Nothing enlarges more than a port of flat glass under water: small areas at the angle a
+# from the axis up to 1 / cos(a)^6 times, for 20 degrees 1.2 and for 40 degrees 4.9 times.
+_MAX_OVER_PORT = 1.5
 
 
 def require_lens(camera: Camera, path: Path) -> None:
@@ -175,7 +175,7 @@ def require_lens(camera: Camera, path: Path) -> None:
 
     Within the ellipse that touches the picture's sides nearly every pixel must have a ray of its
     own, which leads back to it: a distortion whose radius shrinks further out folds the picture.
-    And no place may show small areas much larger than the middle does.
+    And no place may show small areas much larger than the middle does, for its angle.
     """
     if camera.is_fisheye:  # rays end where its model folds
         return
@@ -191,11 +191,16 @@ def require_lens(camera: Camera, path: Path) -> None:
             f"{path}: distortion_coefficients: expected those of a lens, got some that fold "
             f"{100 * folded:.0f} % of the picture onto other parts of it; {CALIBRATE}"
         )
-    enlargement = float(_enlargements(rays[is_inside], camera).max())
-    if not enlargement < _MAX_ENLARGEMENT:
+    enlargements = _enlargements(rays[is_inside], camera)
+    squares = (rays[is_inside] ** 2).sum(axis=1)  # 1 / cos(a)^2
+    over_port = enlargements / squares**3
+    worst = int(np.argmax(over_port))  # NaN counts as the largest
+    if not over_port[worst] < _MAX_OVER_PORT:
+        angle_deg = np.degrees(np.arccos(squares[worst] ** -0.5))
         raise CalibrationError(
             f"{path}: distortion_coefficients: expected those of a lens, got some that enlarge "
-            f"areas {enlargement:.0f} times towards the picture's sides; {CALIBRATE}"
+            f"areas {enlargements[worst]:.1f} times {angle_deg:.0f} degrees off the axis; "
+            f"{CALIBRATE}"
         )
 
 

@@ -64,8 +64,16 @@ def test_areas_are_enlarged_little_or_refused(stretch: float):
     """At the side, with t = k2 r^4, an area is enlarged (1 + t) (1 + 5 t) times."""
     r = 640 / 700 / (1 + stretch)
     camera = with_k(0.0, stretch / r**4)
-    enlargement = (1 + stretch) * (1 + 5 * stretch)
-    if enlargement < 5.9:
+    over_port = (1 + stretch) * (1 + 5 * stretch) / (1 + r**2) ** 3
+    if over_port < 1.48:
         assert refusal(camera) == ""
-    elif enlargement > 6.1:
+    elif over_port > 1.52:
         assert "enlarge" in refusal(camera)
+
+
+def test_a_port_of_flat_glass_passes_where_a_lens_that_wobbles_does_not():
+    """Of the second, areas 22 degrees off the axis are enlarged 2.8 times."""
+    narrow = replace(WIDE, K=np.array([[1533.0, 0, 639.5], [0, 1533.0, 359.5], [0, 0, 1]]))
+    assert refusal(replace(narrow, distortion=np.array([0.39, 0.22, 0.0, 0.0, 0.2]))) == ""
+    wobbly = replace(narrow, distortion=np.array([-5.0, 30.0, 0.0, 0.0, 0.0]))
+    assert "times 22 degrees off the axis" in refusal(wobbly)
