@@ -183,6 +183,12 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
             stored = list(rows(connection, FISH))
             hauls = hauls_of(rows(connection, HAULS))
             vessel = VesselTrack(positions_of(connection))
+        if unknown := {row["run_id"] for row in stored} - runs.keys():
+            raise OutputError(
+                f"{database}: expected the runs of its fish in its table runs, found none of "
+                f"{', '.join(sorted(unknown))}; the file is damaged: use a copy of it, or `replay` "
+                "the recording"
+            )
 
         def fish(row: Mapping[str, Any], estimate: LengthEstimate, run_id: str, **of: str) -> Fish:
             moment_ns = middle_ns(estimate)

@@ -425,7 +425,7 @@ def _check(database: sqlite3.Connection, path: Path) -> None:
     if version > VERSION:
         raise OutputError(
             f"{path}: expected a database of version {VERSION} or before, got version {version}, "
-            "which a newer stream-dmr wrote; upgrade stream-dmr or choose another --out"
+            "which a newer stream-dmr wrote; upgrade stream-dmr to use it"
         )
 
 

@@ -220,6 +220,18 @@ def test_a_file_that_can_not_be_trusted_is_refused_and_left_as_it_is(tmp_path: P
     with pytest.raises(OutputError, match=r"lengths\.db: expected .*; "):
         LengthStore(tmp_path, FACTS)
     assert store.path.read_bytes() == before
+    with pytest.raises(OutputError, match="upgrade" if spoil is spoil_version else "damaged") as e:
+        read_stored_fish(store.path)
+    assert "--out" not in str(e.value)
+
+
+def test_fish_without_their_run_are_refused_in_words(tmp_path: Path):
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        store.add(fish(1))
+    with closing(sqlite3.connect(store.path)) as database, database:
+        database.execute("DELETE FROM runs")
+    with pytest.raises(OutputError, match=r"the runs of its fish .* found none of"):
+        read_stored_fish(store.path)
 
 
 WRITER = """
