@@ -23,6 +23,7 @@ from stream_dmr.files import read_text
 from stream_dmr.settings import Settings
 
 CODE = re.compile(r"[A-Z0-9]{3}")  # FAO 3-alpha
+_PAIR = re.compile(r"\s*([A-Z0-9]{3})\s*=\s*[^\s=]+\s*")  # of a code and a body form
 _EXPECTED = "code,scientific_name,english_name,form"
 LENGTHS = ("total", "fork", "standard", "precaudal", "disc width")
 _LENGTH, _NUMBER = f"({'|'.join(LENGTHS)})", r"(\d+(?:\.\d+)?)"
@@ -91,6 +92,11 @@ def _parse(text: str, *, where: str) -> list[Species]:
             raise ConfigError(
                 f"{where}, line {reader.line_num}: expected a code of three capitals or digits and "
                 f"a name, got {values['code']!r}, {values['scientific_name']!r}"
+            )
+        if values["code"] in (known.code for known in found):
+            raise ConfigError(
+                f"{where}, line {reader.line_num}: expected each code once, got {values['code']!r} "
+                "again; leave one of its lines out"
             )
         found.append(Species(**values))
     return found
@@ -165,8 +171,11 @@ class SpeciesSettings(Settings):
     @field_validator("forms")
     @classmethod
     def _is_pair(cls, pairs: list[str]) -> list[str]:
-        if any(len([part for part in pair.split("=") if part.strip()]) != 2 for pair in pairs):
-            raise ValueError('pairs such as "HAP=halibut"')
+        matches = [_PAIR.fullmatch(pair) for pair in pairs]
+        if None in matches:
+            raise ValueError('pairs of a code and a body form such as "HAP=halibut"')
+        if len({match[1] for match in matches if match}) < len(pairs):
+            raise ValueError("each code once")
         return pairs
 
 

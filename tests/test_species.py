@@ -117,6 +117,7 @@ def test_own_species_are_added_and_replace(tmp_path: Path):
         ("code,name\nXYZ,a\n", "expected the columns code,scientific_name,english_name,form"),
         ("code,scientific_name,english_name\nxy,a,b\n", "line 2: expected a code of three"),
         ("code,scientific_name,english_name\nXYZ,,b\n", "line 2: expected a code of three"),
+        ("code,scientific_name,english_name\nXYZ,a,b\nXYZ,c,d\n", "line 3: .* each code once"),
         ("", "got none"),
     ],
 )
@@ -128,9 +129,19 @@ def test_a_wrong_list_is_refused(tmp_path: Path, text: str, message: str):
         load_species(str(tmp_path / "none.csv"))
 
 
-def test_a_wrong_form_is_refused():
-    with pytest.raises(ConfigError, match=r"\[species\].*HAP=halibut"):
-        parse_config('[species]\nforms = ["halibut"]', where="c")
+@pytest.mark.parametrize(
+    ("forms", "expected"),
+    [
+        ('["halibut"]', "pairs of a code and a body form"),
+        ('["hap=halibut"]', "pairs of a code and a body form"),
+        ('["HAP=halibut", "HAP = salmon"]', "each code once"),
+    ],
+)
+def test_a_wrong_form_is_refused(forms: str, expected: str):
+    with pytest.raises(ConfigError) as refusal:
+        parse_config(f"[species]\nforms = {forms}", where="c")
+    assert str(refusal.value).startswith(f"c [species]: 'forms' expected {expected}")
+    assert str(refusal.value).endswith(f"received {forms}")
 
 
 shares = st.lists(st.floats(0.01, 0.99), min_size=1, max_size=30)

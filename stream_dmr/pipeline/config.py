@@ -325,7 +325,7 @@ def _toml_name(value: object) -> str:
         case str():
             return f'the string "{value}"'
         case list():
-            return "an array"
+            return toml_value(value) if all(isinstance(x, str) for x in value) else "an array"
         case dict():
             return "a table"
         case _:  # a date or a time
