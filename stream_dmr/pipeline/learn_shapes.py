@@ -176,7 +176,7 @@ def with_learnt_shapes(
     if stop.is_set() or next(iter(crops), None) is None:
         return inputs  # without fish the end of the run reports why
     on_part("learning their shapes")
-    return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
+    return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer, stop))
 
 
 def _first_pass(
@@ -205,7 +205,7 @@ def _first_pass(
     return replace(inputs, reader=reader, crops=crops, kept_frames=frames), crops
 
 
-def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:
+def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver, stop: Event) -> S:
     """The setup with the shapes of all these fish together, which the observer reports.
 
     Without candidates the template's own shape stays, unless the fish have another: then their
@@ -214,22 +214,31 @@ def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S
     seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
     forms = setup.candidates
     if forms is None:
-        if mesh_fits_fish(seen_whole, setup, observer):
+        if mesh_fits_fish(seen_whole, setup, observer, stop):
             return setup
         template, forms = load_shapes(AUTO, are_lying=setup.config.localize.rests_on_plane)
         assert forms is not None
         setup = replace(setup, template=template)
-    return replace(setup, candidates=_learn_and_report(seen_whole, setup, forms, observer))
+    return replace(setup, candidates=_learn_and_report(seen_whole, setup, forms, observer, stop))
 
 
-def mesh_fits_fish(crops: Sequence[FishCrop], setup: Setup, observer: RunObserver) -> bool:
-    """True if the mesh fits the fish of these good crops, or there are none. Reports the result."""
+def mesh_fits_fish(
+    crops: Sequence[FishCrop], setup: Setup, observer: RunObserver, stop: Event
+) -> bool:
+    """True if the mesh fits the fish of these good crops, there are none, or `stop` comes before.
+
+    Reports the result.
+    """
     name = setup.template.name
     if not crops:
         observer.warn(f"no fish was seen whole: whether they are like {name} is not known")
         return True
     observer.stage(f"comparing the fish with {name}")
-    found = compare_with_mesh(crops, setup)
+    try:
+        found = compare_with_mesh(crops, setup, progress=lambda step: _raise_if_set(stop))
+    except InterruptedError:
+        observer.warn(f"stopped before the fish were compared with {name}")
+        return True
     if found.is_like_mesh and found.stocks is not None:
         for line in describe(found.mesh, found.stocks):
             observer.notice(line)
@@ -242,12 +251,25 @@ def mesh_fits_fish(crops: Sequence[FishCrop], setup: Setup, observer: RunObserve
 
 
 def _learn_and_report(
-    crops: Iterable[FishCrop], setup: Setup, forms: CandidateShapes, observer: RunObserver
+    crops: Iterable[FishCrop],
+    setup: Setup,
+    forms: CandidateShapes,
+    observer: RunObserver,
+    stop: Event,
 ) -> CandidateShapes:
-    """The stocks of all fish; `forms` if no fish is seen whole, or no stock can be of fish."""
-    stocks = setup.learn(
-        crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
-    )
+    """The stocks of all fish.
+
+    `forms` if no fish is seen whole, no stock can be of fish, or `stop` comes before.
+    """
+
+    def progress(step: str) -> None:
+        _raise_if_set(stop)
+        observer.stage(f"learning their shapes: {step}")
+
+    try:
+        stocks = setup.learn(crops, forms, progress=progress)
+    except InterruptedError:
+        return forms
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
         return forms
@@ -256,6 +278,11 @@ def _learn_and_report(
         for line in describe(forms, learnt):
             observer.notice(line)
     return shapes
+
+
+def _raise_if_set(stop: Event) -> None:
+    if stop.is_set():
+        raise InterruptedError("the run has ended")
 
 
 def _believed(
@@ -410,8 +437,7 @@ class ShapeLearner:
 
     def raise_if_stopped(self, step: str) -> None:
         """End the work at this step if the run has ended. Raises InterruptedError."""
-        if self._stop.is_set():
-            raise InterruptedError("the run has ended")
+        _raise_if_set(self._stop)
 
     def pass_on(self, learnt: LearntShapes) -> None:
         """Measure the fish of this frame and of later frames by the learnt shapes."""

@@ -284,7 +284,7 @@ def _measure(
         if not stop.is_set():
             unused = inputs.finder.unused  # complete only at the end of the source
             if inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt:
-                mesh_fits = mesh_fits_fish(outputs.seen.crops(), inputs, observer)
+                mesh_fits = mesh_fits_fish(outputs.seen.crops(), inputs, observer, stop)
         return replace(summary, parts_s=clock.parts_s()), mesh_fits
     finally:
         inputs.reader.close()

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
@@ -205,7 +206,7 @@ class ReplayInputs(Setup):
 
 
 def read_inputs(
-    request: ReplayOptions, recording: Recording, observer: RunObserver
+    request: ReplayOptions, recording: Recording, observer: RunObserver, stop: Event
 ) -> ReplayInputs:
     """Read the given inputs and take the others from the recording. Raises a UserError.
 
@@ -256,7 +257,7 @@ def read_inputs(
     )
     if request.template is None or not config.fit_mesh.are_shapes_learnt:
         return inputs
-    return learnt_from(messages_of(recording, FishCrop), inputs, observer)
+    return learnt_from(messages_of(recording, FishCrop), inputs, observer, stop)
 
 
 def new_header(

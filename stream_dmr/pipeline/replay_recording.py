@@ -278,7 +278,7 @@ def replay(
     observer = observer or RunObserver()
     recording = open_recordings(request.recordings)
     _refuse_impossible(request, recording)
-    inputs = read_inputs(request, recording, observer)
+    inputs = read_inputs(request, recording, observer, stop)
     recorded = RecordedMessages(recording, request.selection)
     recomputed, carried_over = messages_from(request.first), _carried_over(request, recorded)
     with ExitStack() as stack:

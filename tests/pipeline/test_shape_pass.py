@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,13 +38,19 @@ from tests.support.tiny_clip import write_clip, write_template
 
 
 class Listener(RunObserver):
-    """Hears what a run says, and asks it to stop after so many frames."""
+    """Hears what a run says, and asks it to stop after so many frames, or at a stage."""
 
-    def __init__(self, *, stop_after: int | None = None, needs_pictures: bool = True) -> None:
+    def __init__(
+        self, *, stop_after: int | None = None, stop_at: str = "", needs_pictures: bool = True
+    ) -> None:
         self.needs_pictures, self.sizes = needs_pictures, list[tuple[int, ...]]()
-        self.stop, self._stop_after = threading.Event(), stop_after
+        self.stop, self._stop_after, self._stop_at = threading.Event(), stop_after, stop_at
         self.notices, self.warnings = list[str](), list[str]()
         self.num_frames = 0
+
+    def stage(self, line: str) -> None:
+        if self._stop_at and line.endswith(self._stop_at):
+            self.stop.set()
 
     def notice(self, line: str) -> None:
         self.notices.append(line)
@@ -348,8 +355,11 @@ def test_a_replay_does_not_believe_it_either(learnt: tuple[Path, Listener], tmp_
     assert_learnt(tmp_path / "again", observer)
 
 
-def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Path, tmp_path: Path):
-    out = measured(clip, tmp_path / "out", Listener(stop_after=1)).out
+@pytest.mark.parametrize("stop", [{"stop_after": 1}, {"stop_at": ": 1 fish looked at"}])
+def test_a_stop_while_fish_are_looked_for_or_learnt_leaves_an_empty_valid_result(
+    clip: Path, tmp_path: Path, stop: dict[str, Any]
+):
+    out = measured(clip, tmp_path / "out", Listener(**stop)).out
     assert rows(out / "lengths.csv") == []
     header = read_header(out / "recording.mcap")
     assert header.candidates is not None
@@ -378,6 +388,6 @@ def test_a_shape_that_no_fish_has_is_not_believed(monkeypatch: pytest.MonkeyPatc
     stocks = CandidateShapes.of([far], are_learnt=True)
     monkeypatch.setattr(Setup, "learn", lambda *_, **__: stocks)
     observer = Listener()
-    assert learnt_from([], setup, observer).candidates is forms
+    assert learnt_from([], setup, observer, observer.stop).candidates is forms
     assert len(observer.warnings) == 1
     assert "look whether the masks hold more than the fish" in observer.warnings[0]

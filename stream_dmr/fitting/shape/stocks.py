@@ -156,7 +156,7 @@ def learn_stocks(
     stocks = _shapes_of(groups)
     if is_enough(stocks):
         return stocks
-    groups = learner.reassigned(groups)
+    groups = learner.reassigned(groups, progress)
     progress(f"{len(groups)} stocks")
     return _shapes_of(groups)
 
@@ -221,7 +221,7 @@ class _StockLearner:
             groups = [joined[a, b], *(group for group in groups if group not in (a, b))]
         return groups
 
-    def reassigned(self, groups: list[_Group]) -> list[_Group]:
+    def reassigned(self, groups: list[_Group], progress: Callable[[str], None]) -> list[_Group]:
         """Each fish in the group whose shape its masks prefer, by a new search; stocks relearnt."""
         searches = [self._search(group.stock.coefficients) for group in groups]
         shapes = [group.stock.coefficients for group in groups]
@@ -234,7 +234,8 @@ class _StockLearner:
         def posed(found: list[PosedTarget]) -> list[list[PosedTarget]]:
             return [[search(frame) for frame in found] for search in searches]
 
-        for options in side_by_side(posed, by_fish.values()):
+        for number, options in enumerate(side_by_side(posed, by_fish.values()), 1):
+            progress(f"{number} fish looked at again")
             nats = [
                 list(self._fitter.nats([replace(frame) for frame in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
