@@ -48,8 +48,8 @@ class PositionFile(PositionSource):
         zero_ns = settings.offset_ns if is_since_1970 else settings.zero_utc_ns
         if zero_ns is None:
             raise SourceError(
-                f"--nmea {path}: expected to know when the video began, got no [sensors] start_utc "
-                'in config.toml; add start_utc = "2026-11-22T06:00:00Z" with its time'
+                f"--nmea {path}: expected to know when the video began, got no [sensors] start_utc"
+                '; add it to the file of --config, such as start_utc = "2026-11-22T06:00:00Z"'
             )
         self.name = path.name
         self._path, self._zero_ns = path, zero_ns

@@ -89,7 +89,7 @@ def test_a_file_without_positions_is_refused(tmp_path: Path, name: str, text: st
 
 
 def test_a_video_needs_its_start_and_a_file(tmp_path: Path):
-    with pytest.raises(SourceError, match="start_utc"):
+    with pytest.raises(SourceError, match="add it to the file of --config"):
         opened(tmp_path / "way.nmea", straight_way(3), SensorsSettings())
     with pytest.raises(SourceError, match="for cameras"):
         open_positions("tcp://127.0.0.1:10110", SETTINGS, is_since_1970=False)
