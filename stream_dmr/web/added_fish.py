@@ -213,14 +213,14 @@ class TrackEditor:
         flags = {caught.estimate.track_id: caught.flags for caught in report.fish}
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
-            for part in of_fish:
-                if not frames_of_parts(frames, [part], fish=fish):
-                    raise UserError(
-                        f"verdict: expected frames of fish {part.track_id} in the recording, found "
-                        "none: its segment is gone, as after a disk that ran short; the fish can "
-                        "only be accepted, rejected or a duplicate"
-                    )
             chosen = frames_of_parts(frames, of_fish, fish=fish)
+            gone = [part.track_id for part in of_fish if not frames[part.track_id]]
+            if gone or not chosen:
+                raise UserError(
+                    f"verdict: expected frames of fish {(gone or [fish])[0]} in the recording, "
+                    "found none: its segment is gone, as after a disk that ran short; the fish can "
+                    "only be accepted, rejected or a duplicate"
+                )
             known = [*flags.get(fish, ())]
             known += [flag for part in of_fish for flag in flags.get(part.track_id, ())]
             kept = list(dict.fromkeys(known))
