@@ -19,7 +19,6 @@ from stream_dmr.errors import SourceError
 from stream_dmr.evidence.seal import seal_run
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.recording.reading import open_recordings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
@@ -27,7 +26,7 @@ from stream_dmr.store.length_store import LengthStore
 from stream_dmr.tables import original_cell, safe_cell
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS, fish
-from tests.support.fish_run import measure, request
+from tests.support.fish_run import StopAt, measure, request
 from tests.support.tiny_clip import write_clip
 
 FORMULA = '=HYPERLINK("http://x";"fish")'
@@ -143,21 +142,6 @@ def test_a_run_that_did_not_see_the_end_says_nothing_of_boxes_past_it(tmp_path: 
     asked = request(clip, tmp_path / "stopped", boxes=clip / "boxes.txt")
     measure_source(asked, stop=observer.stop, observer=observer)
     assert not [line for line in observer.warned if "past the end" in line]
-
-
-class StopAt(RunObserver):
-    """Sets the event after so many frames, and keeps the warnings."""
-
-    def __init__(self, num_frames: int) -> None:
-        self.stop, self.warned, self._left = threading.Event(), list[str](), num_frames
-
-    def warn(self, line: str) -> None:
-        self.warned.append(line)
-
-    def frame_done(self) -> None:
-        self._left -= 1
-        if self._left == 0:
-            self.stop.set()
 
 
 CHANGES: dict[str, Callable[[Path], object]] = {

@@ -10,12 +10,12 @@ import pytest
 from stream_dmr.messages import FishCrop, Frame, TrackEnded
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.replay_inputs import read_inputs
-from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import CropFishOfRuns
 from stream_dmr.recording.header import RunHeader, RunStart, joined_runs
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import open_recordings
+from tests.support.fish_run import StopAt
 from tests.support.recorded_run import header
 
 FIRST, SECOND = (
@@ -85,23 +85,13 @@ def test_tracks_end_after_the_frames_at_which_the_run_paused():
     assert crop_fish.frames == [1, 2, 0, 3]
 
 
-class Listener(RunObserver):
-    """Keeps the warnings."""
-
-    def __init__(self) -> None:
-        self.warned = list[str]()
-
-    def warn(self, line: str) -> None:
-        self.warned.append(line)
-
-
 @pytest.mark.parametrize(("second", "is_said"), [(SECOND, False), (WITH_BOXES, True)])
 def test_runs_whose_beginnings_are_not_known_are_said(
     tmp_path: Path, second: RunStart, is_said: bool
 ):
     recorded = replace(header(), runs=(FIRST, second))
     McapSink(tmp_path / "x.mcap", recorded, flush_s=1.0).close()
-    observer, path = Listener(), tmp_path / "x.mcap"
+    observer, path = StopAt(1), tmp_path / "x.mcap"
     read_inputs(ReplayOptions(recordings=[path], first="crop"), open_recordings([path]), observer)
     assert any("do not record at which frame" in line for line in observer.warned) is is_said
 

@@ -37,7 +37,7 @@ from stream_dmr.recording.reading import (
 from stream_dmr.store.open_results import LEARNT
 from tests.support.command import rows
 from tests.support.final_estimates import fish as finished
-from tests.support.fish_run import request
+from tests.support.fish_run import StopAt, request
 from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
 from tests.support.tiny_clip import calibration, draw_mask, write_clip, write_template
@@ -172,16 +172,6 @@ def test_a_restart_changes_no_length_of_fish_before_and_after_it(runs: list[Path
     assert (shapes[7] or 0) > (shapes[3] or 0)  # learnt from fish of both runs
 
 
-class Warned(RunObserver):
-    """Keeps the warnings of a run."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def warn(self, line: str) -> None:
-        self.lines.append(line)
-
-
 @pytest.mark.slow
 def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -189,11 +179,11 @@ def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     (tmp_path / LEARNT).write_text("mine")
     monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
     monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
-    observer = Warned()
+    observer = StopAt(-1)
     asked = request(clip, tmp_path, template="auto")
     measure_source(asked, stop=threading.Event(), observer=observer)
     assert (tmp_path / LEARNT).read_text() == "mine"
-    assert [line for line in observer.lines if f"{LEARNT}: expected a name that is free" in line]
+    assert [line for line in observer.warned if f"{LEARNT}: expected a name that is free" in line]
     assert len(rows(tmp_path / "lengths.csv")) == 4
 
 
@@ -210,10 +200,10 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
     write_template(tmp_path, "mine", half_breadth=half_breadth)
     monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
     monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
-    observer, mesh, out = Warned(), str(tmp_path / "mine.ply"), tmp_path / "out"
+    observer, mesh, out = StopAt(-1), str(tmp_path / "mine.ply"), tmp_path / "out"
     asked = request(clip, out, template=mesh)
     measure_source(asked, stop=threading.Event(), observer=observer)
-    lines = [line for line in observer.lines if "the fish are not like mine: " in line]
+    lines = [line for line in observer.warned if "the fish are not like mine: " in line]
     assert len(lines) == (0 if is_believed else 1)
     assert candidates_of(out) == {1: 0, 2: 0, 3: 0, 4: 0 if is_believed else 1}
     assert (out / LEARNT).exists() != is_believed

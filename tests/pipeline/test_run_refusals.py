@@ -1,8 +1,6 @@
 """Bad input to `stream-dmr run`: one clear line, exit code 2, and what was computed is kept."""
 
-import contextlib
 import re
-import subprocess
 import wave
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +15,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Frame
 from tests.support.command import Outcome, invoke, rows
 from tests.support.reading import read_messages
+from tests.support.small_disk import fill, small_disk
 from tests.support.tiny_clip import QUICK, calibration, draw_mask, draw_picture, options, write_clip
 
 Options = dict[str, str]
@@ -227,18 +226,13 @@ def test_a_video_cut_off_is_measured_as_far_as_it_goes(clip: Path):
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk with room for the start of a run."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
-        pytest.skip("needs the right to mount a small disk")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """With room for the start of a run."""
+    with small_disk(tmp_path / "disk", kilobytes=256) as disk:
+        yield disk
 
 
-def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_came_before(tmp_path, small_disk: Path):
+def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_came_before(tmp_path, disk: Path):
     noise = np.random.default_rng(0)
     clip = tmp_path / "clip"
     options = write_clip(clip, num_frames=1)
@@ -249,23 +243,22 @@ def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_came_before(tmp_path, 
         cv2.imwrite(str(clip / "pictures" / f"{frame_index}.png"), picture)
         cv2.imwrite(str(clip / "masks" / f"{frame_index:06d}.png"), draw_mask(frame_index, [1]))
     del options["--boxes"]
-    options |= {"--source": str(clip / "pictures"), "--out": str(small_disk / "out")}
+    options |= {"--source": str(clip / "pictures"), "--out": str(disk / "out")}
     outcome = invoke("run", options)
     assert_refused(outcome, "(?i)no space left on device")
 
-    (recording,) = (small_disk / "out").glob("recording.mcap*")
+    (recording,) = (disk / "out").glob("recording.mcap*")
     kept = []
     try:
         kept.extend(message.frame_index for message in read_messages(recording, [Frame]))
     except RecordingError:
         assert recording.suffix == ".part"  # not even its end had room
     assert kept == list(range(1, len(kept) + 1))
-    assert rows(small_disk / "out" / "frames.csv")[0]["frame_index"] == "1"
+    assert rows(disk / "out" / "frames.csv")[0]["frame_index"] == "1"
 
 
-def test_a_full_disk_is_refused_before_the_first_frame(tmp_path: Path, small_disk: Path):
+def test_a_full_disk_is_refused_before_the_first_frame(tmp_path: Path, disk: Path):
     options = write_clip(tmp_path / "clip", num_frames=3)
-    with (small_disk / "ballast").open("wb") as ballast, contextlib.suppress(OSError):
-        ballast.write(bytes(1 << 20))
-    outcome = invoke("run", options | {"--out": str(small_disk / "out")})
+    fill(disk)
+    outcome = invoke("run", options | {"--out": str(disk / "out")})
     assert_refused(outcome, "(?i)no space left on device")

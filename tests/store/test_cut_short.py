@@ -31,23 +31,11 @@ from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import render_page
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS, fish
-from tests.support.fish_run import measure, request
+from tests.support.fish_run import StopAt, measure, request
 from tests.support.sources import SETTINGS
 from tests.support.tiny_clip import write_clip
 
 NUM_FRAMES = 40  # more than the queues of the chain hold
-
-
-class StopAfter(RunObserver):
-    """Stops a run when so many frames are done."""
-
-    def __init__(self, num_frames: int) -> None:
-        self.stop, self._left = threading.Event(), num_frames
-
-    def frame_done(self) -> None:
-        self._left -= 1
-        if not self._left:
-            self.stop.set()
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +43,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of a run that was stopped after some of its frames."""
     folder = tmp_path_factory.mktemp("fish")
     write_clip(folder / "clip", fish=[[1, 2]] * NUM_FRAMES)
-    observer = StopAfter(2)
+    observer = StopAt(2)
     asked = request(folder / "clip", folder / "out")
     measure_source(asked, stop=observer.stop, observer=observer)
     return folder / "out"

@@ -4,10 +4,28 @@ import threading
 from pathlib import Path
 
 from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import RunOptions
 from tests.support.tiny_clip import write_clip
 
 FISH = [[1], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
+
+
+class StopAt(RunObserver):
+    """Sets the event when so many frames are done, and keeps the warnings."""
+
+    def __init__(self, num_frames: int) -> None:
+        self.stop, self.warned, self._left = threading.Event(), list[str](), num_frames
+        if num_frames == 0:
+            self.stop.set()
+
+    def warn(self, line: str) -> None:
+        self.warned.append(line)
+
+    def frame_done(self) -> None:
+        self._left -= 1
+        if self._left == 0:
+            self.stop.set()
 
 
 def request(clip: Path, out: Path, **other: object) -> RunOptions:
