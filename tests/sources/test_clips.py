@@ -147,7 +147,7 @@ def test_a_restart_changes_no_capture_time(tmp_path: Path):
         clip(tmp_path / name, first=number, num_frames=20)
     os.utime(tmp_path / "2.avi", (OLD_S + 30, OLD_S + 30))
     times = [frame.timestamp_ns for frame in ClipFolder(tmp_path, AT_ONCE)]
-    for num_done in (1, 9, 20, 33):
+    for num_done in (9, 20, 33):
         folder = ClipFolder(tmp_path, AT_ONCE)
         in_work = {f"{1 + num_done // 20}.avi": num_done % 20}
         done = frozenset({"1.avi"} if num_done >= 20 else ())

@@ -13,6 +13,12 @@ def bank() -> PatchBank:
     return make_bank(num_fish=12, num_backgrounds=4, seed=5, progress=lambda: None)
 
 
+@pytest.fixture(scope="module")
+def samples(bank: PatchBank) -> list[TrainingSample]:
+    seeds = ((1, seed) for seed in range(150))
+    return [draw_sample(np.random.default_rng(seed), size_px=128, bank=bank) for seed in seeds]
+
+
 def assert_equal(one: TrainingSample, other: TrainingSample):
     for name in ("image", "mask", "in_box", "ends_px"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -28,10 +34,9 @@ def test_equal_seeds_give_equal_pictures(bank):
     np.testing.assert_array_equal(again.fish, bank.fish)
 
 
-def test_boxes_fit_their_fish(bank):
+def test_boxes_fit_their_fish(samples):
     shares, extents = [], []
-    for seed in range(150):
-        sample = draw_sample(np.random.default_rng((1, seed)), size_px=128, bank=bank)
+    for sample in samples:
         assert 0 <= sample.mask.min() <= sample.mask.max() <= 1 + 1e-6
         if sample.in_box.min() == 1 or sample.mask.sum() < 50:
             continue  # no box is given, or next to nothing is seen
@@ -44,10 +49,9 @@ def test_boxes_fit_their_fish(bank):
     assert len(shares) > 100
 
 
-def test_heads_and_tails_lie_at_the_ends_of_their_fish(bank):
+def test_heads_and_tails_lie_at_the_ends_of_their_fish(samples):
     distances = []
-    for seed in range(80):
-        sample = draw_sample(np.random.default_rng((2, seed)), size_px=128, bank=bank)
+    for sample in samples:
         if sample.ends_px is None:
             assert sample.in_box.min() == 1 or not sample.mask.any()  # no box, or no fish in it
             continue
