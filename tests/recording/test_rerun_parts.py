@@ -154,7 +154,10 @@ def test_an_rrd_is_not_begun_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.
 def test_a_script_without_a_guard_reads_an_rrd(rrd, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        f"import stream_dmr as sd\nprint(len(list(sd.open({str(rrd)!r}, [sd.LengthEstimate]))))\n"
+        "from pathlib import Path\n"
+        "from stream_dmr.messages import LengthEstimate\n"
+        "from stream_dmr.recording.rerun.rrd_file import RrdRecording\n"
+        f"print(len(list(RrdRecording(Path({str(rrd)!r})).payloads([LengthEstimate]))))\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

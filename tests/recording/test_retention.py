@@ -201,18 +201,18 @@ def test_recording_goes_on_when_there_is_room_again(disk: Path, messages: list[M
 
 
 def test_a_full_disk_does_not_stop_measuring(tmp_path: Path):
-    with small_disk(tmp_path / "disk", kilobytes=500) as disk:
-        options = write_clips(tmp_path / "clip", num_frames=40)
+    with small_disk(tmp_path / "disk", kilobytes=300) as disk:
+        options = write_clips(tmp_path / "clip", num_frames=24)
         options |= {"--out": str(disk / "out")}
         with_pictures(options)
         outcome = invoke("run", options)
         assert outcome.code == 0, outcome.err
         assert "nothing is recorded but lengths" in outcome.err
-        assert "40 frames" in outcome.out
+        assert "24 frames" in outcome.out
         with sqlite3.connect(disk / "out" / "lengths.db") as database:
             fish = database.execute("SELECT frames_seen FROM fish").fetchall()
         database.close()
-        assert sum(seen for (seen,) in fish) > 25
+        assert sum(seen for (seen,) in fish) > 15
 
 
 def with_pictures(options: dict[str, str]) -> None:
