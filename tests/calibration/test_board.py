@@ -183,7 +183,7 @@ def test_a_view_that_fits_badly_is_left_out(folder, views, renderer, tmp_path, r
     rows, columns = np.mgrid[:480, :640].astype(np.float32)
     torn = cv2.remap(picture, columns + 6 * np.sin(rows / 50), rows, 1)  # a rolling shutter
     bad = save(tmp_path / "torn.png", torn)
-    mixed = calibrate([bad, *views], plane_image=folder / "plane.png")
+    mixed = calibrate([bad, *views], plane_image=folder / "plane.png", model="pinhole")
     assert [left.path for left in mixed.left_out] == [bad]
     assert "px off" in mixed.left_out[0].reason
     same_lens(mixed, result)
