@@ -45,6 +45,8 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     clip = tmp_path_factory.mktemp("changed") / "clip"
     options = clips_of(clip)
+    with (clip / "quick.toml").open("a") as config:
+        config.write("\n[recording]\nrrd = false\n")  # verify would read them, for seconds each
     add_clip(clip, "2.mp4")
     assert invoke("run", options).code == 0
     dark = cv2.VideoWriter(

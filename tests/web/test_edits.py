@@ -82,10 +82,6 @@ def test_an_added_fish_is_measured_as_run_does_with_the_same_boxes(
 
 
 def run_again(measured: Path, out: Path, **other: object) -> None:
-    import threading
-
-    from stream_dmr.pipeline.measure_source import measure_source
-
     clip = measured.parent / "clip"
     measure_source(request(clip, out, **other), stop=threading.Event())
 
