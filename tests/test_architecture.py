@@ -94,14 +94,19 @@ MODULES = {module_of(path) for path in FILES}
 
 
 @cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
 def imports(path: Path, *, top_only: bool = False) -> list[str]:
     """The modules that a file imports; `from package import module` as the module."""
     return list(_imports(path, top_only=top_only))
 
 
 def _imports(path: Path, *, top_only: bool) -> Iterator[str]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in tree.body if top_only else ast.walk(tree):
+    nodes = nodes_of(path)
+    for node in nodes[0].body if top_only else nodes:  # type: ignore[attr-defined]
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -154,9 +159,8 @@ def test_file_names_are_unique():
 
 
 def test_class_names_are_unique():
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in FILES]
-    classes = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
-    counts = Counter(node.name for node in classes)
+    nodes = (node for path in FILES for node in nodes_of(path))
+    counts = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
     assert not [name for name, count in counts.items() if count > 1]
 
 
@@ -173,8 +177,7 @@ def test_nobody_uses_private_names_of_others():
 
 def private_uses(path: Path) -> Iterator[str]:
     """Private names that a file imports, or takes of objects that are not its own."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    nodes = list(ast.walk(tree))
+    nodes = nodes_of(path)
     own = {node.attr for node in nodes if isinstance(node, ast.Attribute) and is_own(node)}
     own |= {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     for node in nodes:
