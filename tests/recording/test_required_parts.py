@@ -60,14 +60,6 @@ def test_a_fish_or_a_time_that_is_not_in_it_is_refused(folder: Path, tmp_path: P
     assert said == "--time 100:200: expected a time of the recording, from 0 to 0.5 s, got none"
 
 
-def test_what_is_not_in_an_rrd_is_refused_alike(folder: Path):
-    recording = open_recordings([folder / "recording.rrd"])
-    with pytest.raises(UserError, match="--track 77: expected a fish"):
-        require_selected(recording, Selection(tracks=frozenset({2, 77})))
-    with pytest.raises(UserError, match=r"from 0 to 0\.5 s"):
-        require_selected(recording, Selection.from_seconds((100.0, 200.0)))
-
-
 def test_times_of_a_camera_are_told_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
     """They are seconds since 1970."""
     recording, black = open_recordings([folder]), np.zeros((2, 2, 3), np.uint8)
