@@ -19,10 +19,3 @@ def test_totals_of_an_endless_run_keep_the_last_fish():
     for track_id in range(1, 6):
         totals.take(fish(track_id))
     assert [one.track_id for one in totals.fish()] == [4, 5]
-
-
-def test_totals_count_frames():
-    totals = RunTotals(max_fish=None)
-    for _ in range(3):
-        totals.frame_done()
-    assert totals.num_frames == 3
