@@ -27,32 +27,14 @@ from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.solver.spine import KINDS
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.template.template_file import load_template
-from tests.support.shapes import (
-    POINTS,
-    anchor,
-    crop_camera,
-    crop_of,
-    fish_template,
-    pose,
-    random_flat,
-    seeds,
-)
+from tests.support import batches
+from tests.support.batches import PLANE_NORMAL
+from tests.support.shapes import anchor, crop_camera, crop_of, pose, random_flat, seeds
 
-THREE_JOINTS = {
-    **POINTS,
-    "joints": np.array([[-0.2, 0.03, 0.006], [0.0, -0.01, 0.002], [0.2, -0.02, 0.0]]),
-}
-TEMPLATES = {
-    "2 joints": fish_template(),
-    "3 joints": fish_template(points=THREE_JOINTS),
-    "halibut": load_template("halibut"),
-    "cod": load_template("cod"),
-}
+TEMPLATES = batches.TEMPLATES | {"cod": load_template("cod")}
 BODIES = {name: Body.from_template(template) for name, template in TEMPLATES.items()}
 RIGS = {name: Rig.from_template(template) for name, template in TEMPLATES.items()}
 CAMERA = crop_camera()
-# A plane that looks past the camera, so that no component of its normal is 0.
-PLANE_NORMAL = np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93])
 
 every_template = pytest.mark.parametrize("name", TEMPLATES)
 both_kinds = pytest.mark.parametrize("kind", KINDS)
@@ -115,17 +97,6 @@ class TestRotation:
             total = total + term
         _, J = linear_blend.rotation_and_jacobian(w)
         np.testing.assert_allclose(J, total, atol=1e-10)
-
-    @given(seed=seeds, angle=angles)
-    def test_right_jacobian_is_the_slope(self, seed, angle):
-        """R(w + d) = R(w) exp(J_r d) to first order."""
-        w = self.vector(seed, angle)
-        _, J = linear_blend.rotation_and_jacobian(w)
-        slopes = []
-        for step in np.eye(3) * 1e-5:
-            ahead, behind = (linear_blend.rotation_and_jacobian(w + s)[0] for s in (step, -step))
-            slopes.append(Rotation.from_matrix(behind.T @ ahead).as_rotvec() / 2e-5)
-        np.testing.assert_allclose(J, np.transpose(slopes), atol=1e-8)
 
     @staticmethod
     def vector(seed, angle):

@@ -190,7 +190,8 @@ def test_a_head_that_one_camera_takes_for_the_tail_changes_no_length(scene, comb
 def test_a_poor_fit_by_one_camera_counts_where_a_mesh_fits_both_masks(scene, combined, tmp_path):
     """By a limit that many of these good fits fail; the mesh is held to a limit of its own."""
     limit = 0.945
-    (tmp_path / "config.toml").write_text(f"[localize]\nmin_iou = {limit}\n")
+    config = f"[localize]\nmin_iou = {limit}\n[recording]\nrrd = false\n"
+    (tmp_path / "config.toml").write_text(config)
     request = ReplayOptions(
         recordings=[scene / "run"],
         first="localize",
