@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -92,7 +93,7 @@ def test_runs_whose_beginnings_are_not_known_are_said(
     recorded = replace(header(), runs=(FIRST, second))
     McapSink(tmp_path / "x.mcap", recorded, flush_s=1.0).close()
     observer, path = StopAt(1), tmp_path / "x.mcap"
-    read_inputs(ReplayOptions(recordings=[path], first="crop"), open_recordings([path]), observer)
+    read_inputs(ReplayOptions(recordings=[path], first="crop"), open_recordings([path]), observer, Event())
     assert any("do not record at which frame" in line for line in observer.warned) is is_said
 
 

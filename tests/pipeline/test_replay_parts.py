@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def of_kinds(recorded: RecordedMessages, kinds: list[type[Message]]) -> Iterator
 
 
 def test_what_is_not_given_is_as_it_was_recorded(recording: Recording, folder: Path):
-    inputs = read_inputs(ReplayOptions(recordings=[folder]), recording, RunObserver())
+    inputs = read_inputs(ReplayOptions(recordings=[folder]), recording, RunObserver(), Event())
     assert_same(inputs.template, recording.header.template)
     assert_same(inputs.calibration, recording.header.calibration)
     assert inputs.files is None
@@ -67,7 +68,7 @@ def test_a_given_calibration_replaces_the_recorded_one(
     path = tmp_path / "other.yaml"
     save_calibration(path, given)
     request = ReplayOptions(recordings=[folder], calibration=path, command="stream-dmr replay")
-    inputs = read_inputs(request, recording, RunObserver())
+    inputs = read_inputs(request, recording, RunObserver(), Event())
     assert inputs.calibration is not None
     np.testing.assert_array_equal(inputs.calibration.plane.translation_mm, [0, 0, 1200])
     written = new_header(request, recording.header, inputs, None)
@@ -90,7 +91,7 @@ def test_a_given_calibration_whose_plane_is_unlikely_is_named_as_by_a_run(
     path = tmp_path / "near.yaml"
     save_calibration(path, replace(calibration(), plane=plane))
     request = ReplayOptions(recordings=[folder], calibration=path, first="localize")
-    hang = read_inputs(request, recording, Lines()).config.fit_mesh.hang
+    hang = read_inputs(request, recording, Lines(), Event()).config.fit_mesh.hang
     said = " ".join(lines)
     assert "tvec must be in mm" in said
     assert "leans 35 degrees" in said
@@ -103,7 +104,7 @@ def test_no_shapes_are_learnt_where_the_settings_have_none(
     config = tmp_path / "paper.toml"
     config.write_text('[fit_mesh]\ndeformation = "linear-blend"\n')
     request = ReplayOptions(recordings=[folder], template="auto", config=config)
-    inputs = read_inputs(request, recording, RunObserver())
+    inputs = read_inputs(request, recording, RunObserver(), Event())
     assert inputs.candidates is not None
     assert not inputs.candidates.are_learnt
 
