@@ -257,13 +257,17 @@ def learnt_before(out: Path, header: RunHeader) -> list[LearntShapes]:
     return []
 
 
+# To look for earlier fish in: 16 hours of a camera, in two seconds. A week has ten thousand.
+_MAX_SEGMENTS = 1000
+
+
 def seen_before(out: Path) -> SeenFish:
     """The last fish that earlier runs in a folder recorded and finished, to learn from.
 
     Segments that can't be read, or whose masks were removed, are left out.
     """
     finished, segments = set[int](), list[Recording]()
-    for segment in _segments(out, "mcap"):
+    for segment in _segments(out, "mcap")[:_MAX_SEGMENTS]:
         if len(finished) >= MAX_FISH:
             break
         with suppress(RecordingError):

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from stream_dmr.camera import Camera
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes, LengthEstimate
+from stream_dmr.pipeline import run_outputs
 from stream_dmr.pipeline.learn_shapes import SeenFish, ShapeLearner
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import ReplayOptions, replay
@@ -139,7 +140,9 @@ def test_a_restart_knows_what_was_learnt_and_learns_on_from_the_fish_of_both_run
 
 
 @pytest.mark.slow
-def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(runs: list[Path]):
+def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(
+    runs: list[Path], monkeypatch: pytest.MonkeyPatch
+):
     seen = SeenFish()
     for kind in (FishCrop, LengthEstimate):
         for message in messages_of(open_recordings([runs[1]]), kind):
@@ -148,6 +151,8 @@ def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(runs: list[Pat
     assert before.num == seen.num == 8
     for one, other in zip(before.crops(), seen.crops(), strict=True):
         assert encode(one) == encode(other)
+    monkeypatch.setattr(run_outputs, "_MAX_SEGMENTS", 1)
+    assert 0 < seen_before(runs[1]).num < 8  # of the last segment
 
 
 @pytest.mark.slow

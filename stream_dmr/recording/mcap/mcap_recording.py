@@ -98,7 +98,8 @@ class McapRecording:
         self, topics: Collection[str], selection: Selection
     ) -> Iterator[tuple[str, McapMessage]]:
         with self._open() as stream:
-            if selection.is_everything or _is_torn(stream) or not _has_index(stream):
+            is_whole = selection.is_everything and len(topics) >= len(TOPICS)  # to its last byte
+            if is_whole or _is_torn(stream) or not _has_index(stream):
                 yield from self._in_order(stream, topics, selection)
             else:
                 yield from _by_index(stream, topics, selection)
