@@ -93,7 +93,8 @@ def test_runs_whose_beginnings_are_not_known_are_said(
     recorded = replace(header(), runs=(FIRST, second))
     McapSink(tmp_path / "x.mcap", recorded, flush_s=1.0).close()
     observer, path = StopAt(1), tmp_path / "x.mcap"
-    read_inputs(ReplayOptions(recordings=[path], first="crop"), open_recordings([path]), observer, Event())
+    request = ReplayOptions(recordings=[path], first="crop")
+    read_inputs(request, open_recordings([path]), observer, Event())
     assert any("do not record at which frame" in line for line in observer.warned) is is_said
 
 
