@@ -50,9 +50,9 @@ class Selection:
         track_id = getattr(message, "track_id", None)
         return self.tracks is None or track_id is None or track_id in self.tracks
 
-    def narrowed_to(self, spans: Spans) -> "Selection":
-        """The same selection with no more time than its tracks span; no spans: as it is."""
-        if self.tracks is None or not spans:
+    def narrowed_to(self, spans: Spans | None) -> "Selection":
+        """The same selection with no more time than its tracks span; None, not known: as it is."""
+        if self.tracks is None or spans is None:
             return self
         seen = [spans[track_id] for track_id in self.tracks if track_id in spans]
         first = min((span[0] for span in seen), default=0)

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stream_dmr.errors import UserError
 from stream_dmr.messages import Frame
 from stream_dmr.recording.codec import encode
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import (
+    decoded_messages,
     open_recordings,
     require_frame,
     require_messages,
@@ -24,7 +27,7 @@ from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.command import invoke, rows
 from tests.support.fish_run import measure
-from tests.support.recorded_run import header
+from tests.support.recorded_run import FRAME_NS, header
 from tests.support.recorded_run import run as made_up_run
 
 COMMANDS = (
@@ -125,3 +128,38 @@ def test_fish_of_a_recording_that_was_deleted_are_still_exported(folder: Path, t
     recording, second = open_recordings([tmp_path]), Selection(tracks=frozenset({2}))
     with pytest.raises(UserError, match="--track 2"):
         require_selected(recording, second)
+
+
+@pytest.fixture(scope="module")
+def two_segments(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("segments")
+    messages = [*made_up_run(6, num_fish=2)]
+    for number, is_first in ((1, True), (2, False)):
+        path = folder / f"recording-00000{number}.mcap"
+        with closing(McapSink(path, header(), flush_s=0.0)) as sink:
+            for message in messages:
+                if (message.frame_index <= 3) == is_first:
+                    sink.write(make_record(message, RecordingSettings()))
+    return folder
+
+
+@given(
+    # Frames of a fish are those between its first and its last of a file.
+    kinds=st.sets(st.sampled_from([kind for kind in TOPICS if kind is not Frame]), min_size=1),
+    tracks=st.none() | st.frozensets(st.integers(1, 3)),
+    frames=st.none() | st.tuples(st.integers(0, 4), st.integers(4, 8)),
+)
+def test_a_part_is_what_of_the_whole_is_in_it(two_segments: Path, kinds, tracks, frames):
+    recording = open_recordings([two_segments])
+    time_ns = None if frames is None else (frames[0] * FRAME_NS, frames[1] * FRAME_NS)
+    selection = Selection(tracks=tracks, time_ns=time_ns)
+    part = [encode(message) for message, _ in decoded_messages(recording, [*kinds], selection)]
+    whole = [message for message, _ in decoded_messages(recording, [*TOPICS])]
+    wanted = [
+        encode(message)
+        for message in whole
+        if type(message) in kinds
+        and selection.includes_time(message.timestamp_ns)
+        and selection.includes(message)
+    ]
+    assert part == wanted

@@ -1,22 +1,24 @@
 """Read an .mcap, also without its end.
 
 Every byte is covered by a checksum: each chunk has one, and so has the data section as a whole,
-which is why everything is read in file order. A selection is read by the index instead, covered by
-the checksums of the index and of the chunks that are read.
+which is why all of it is read in file order. Some messages or times are read by the index instead,
+covered by the checksums of the index and of the chunks that are read.
 """
 
 import json
 import struct
 import zlib
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import IO
 
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Metadata
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, DataEnd, Footer, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -70,11 +72,8 @@ class McapRecording:
 
     def tracks(self) -> Collection[int]:
         """The track ids in it, read from the index if it has one."""
-        with self._open() as stream:
-            if not _is_torn(stream) and _has_index(stream):
-                spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
-                if spans:
-                    return spans.keys()
+        if self._index is not None and self._index.tracks is not None:
+            return self._index.tracks.keys()
         fish = (payload for _, payload in self.payloads([LocalizedFish]))
         return {decode(LocalizedFish, payload).track_id for payload in fish}
 
@@ -97,12 +96,22 @@ class McapRecording:
     def _messages(
         self, topics: Collection[str], selection: Selection
     ) -> Iterator[tuple[str, McapMessage]]:
+        is_whole = selection.is_everything and len(topics) >= len(TOPICS)  # to its last byte
+        index = None if is_whole else self._index
+        if index is not None:
+            selection = selection.narrowed_to(index.tracks)
+            if not index.has_any(selection):
+                return  # without opening it: one of the thousands of a camera
         with self._open() as stream:
-            is_whole = selection.is_everything and len(topics) >= len(TOPICS)  # to its last byte
-            if is_whole or _is_torn(stream) or not _has_index(stream):
+            if index is None:
                 yield from self._in_order(stream, topics, selection)
             else:
                 yield from _by_index(stream, topics, selection)
+
+    @cached_property
+    def _index(self) -> "_Index | None":
+        with self._open() as stream:
+            return None if _is_torn(stream) or not _has_index(stream) else _read_index(stream)
 
     def _in_order(
         self, stream: IO[bytes], topics: Collection[str], selection: Selection
@@ -227,17 +236,42 @@ def _by_index(
     _check_index(stream, _footer(stream))
     stream.seek(0)
     reader = SeekingReader(stream, validate_crcs=True)
-    first, last = selection.narrowed_to(_spans(stream, reader)).bounds_ns
+    first, last = selection.bounds_ns
     for _, channel, message in reader.iter_messages(
         list(topics), starting_at=first, ending_before=last, log_time_order=False
     ):
         yield channel.topic, message
 
 
-def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
-    """The first and last capture time of each track; empty if the file has no such record."""
-    summary = reader.get_summary()
-    for index in summary.attachment_indexes if summary else ():
+@dataclass(frozen=True, kw_only=True)
+class _Index:
+    """What the end of a file says of its messages."""
+
+    first_ns: int  # capture times
+    last_ns: int
+    tracks: Spans | None  # None if the file has no such record
+
+    def has_any(self, selection: Selection) -> bool:
+        """False if no message is of the selected time."""
+        first, last = selection.bounds_ns
+        return (first is None or first <= self.last_ns) and (last is None or self.first_ns < last)
+
+
+def _read_index(stream: IO[bytes]) -> _Index:
+    _check_index(stream, _footer(stream))
+    stream.seek(0)
+    summary = SeekingReader(stream, validate_crcs=True).get_summary()
+    if summary is None or summary.statistics is None:
+        raise ValueError("its index has no statistics")
+    return _Index(
+        first_ns=summary.statistics.message_start_time,
+        last_ns=summary.statistics.message_end_time,
+        tracks=_spans(stream, summary.attachment_indexes),
+    )
+
+
+def _spans(stream: IO[bytes], attachments: Iterable[AttachmentIndex]) -> Spans | None:
+    for index in attachments:
         if index.name == SPANS:
             stream.seek(index.offset)
             record = stream.read(index.length)  # opcode and length (9 bytes), content, CRC-32
@@ -245,7 +279,7 @@ def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
                 raise ValueError(f"the checksum of {SPANS} is wrong")
             text = record[-4 - index.data_size : -4]
             return {int(track_id): tuple(span) for track_id, span in json.loads(text).items()}
-    return {}
+    return None
 
 
 def _has_index(stream: IO[bytes]) -> bool:
