@@ -15,12 +15,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, DataEnd, Footer, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
@@ -235,12 +237,25 @@ def _by_index(
 ) -> Iterator[tuple[str, McapMessage]]:
     _check_index(stream, _footer(stream))
     stream.seek(0)
-    reader = SeekingReader(stream, validate_crcs=True)
+    summary = SeekingReader(stream, validate_crcs=True).get_summary() or Summary()
+    wanted = {
+        n: channel.topic for n, channel in summary.channels.items() if channel.topic in topics
+    }
     first, last = selection.bounds_ns
-    for _, channel, message in reader.iter_messages(
-        list(topics), starting_at=first, ending_before=last, log_time_order=False
-    ):
-        yield channel.topic, message
+    # The library's own search has all chunks in memory before it gives the first message out.
+    for index in summary.chunk_indexes:
+        is_early = first is not None and index.message_end_time < first
+        is_late = last is not None and last <= index.message_start_time
+        if is_early or is_late or wanted.keys().isdisjoint(index.message_index_offsets):
+            continue
+        stream.seek(index.chunk_start_offset + 1 + 8)  # opcode and length
+        for record in breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True):
+            if (
+                isinstance(record, McapMessage)
+                and record.channel_id in wanted
+                and selection.includes_time(record.log_time)
+            ):
+                yield wanted[record.channel_id], record
 
 
 @dataclass(frozen=True, kw_only=True)
