@@ -33,15 +33,16 @@ from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.verify_batch import check_batch
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, track_of
+from stream_dmr.recording.codec import decode
 from stream_dmr.recording.mcap.mcap_recording import is_torn
 from stream_dmr.recording.reading import (
     Recording,
-    decoded_messages,
     messages_of,
     open_recordings,
 )
 from stream_dmr.recording.repair import DAMAGED
-from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.selection import Selection
+from stream_dmr.recording.topics import TOPICS
 from stream_dmr.store.batch_folder import VIDEOS
 from stream_dmr.store.edits import (
     ReviewedMessages,
@@ -452,11 +453,14 @@ def _recording(
             if now != was:
                 yield Change(path, f"{name} is {now}, no run in {DATABASE} has")
     waiting: dict[tuple[int, int], LocalizedFish] = {}
-    for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
+    for kind, payload in recording.payloads([*TOPICS]):  # all kinds: up to its last byte
+        if kind not in (LocalizedFish, LengthEstimate):
+            continue
+        message = decode(kind, payload)
         key = message.frame_index, track_of(message)
         if isinstance(message, LocalizedFish):
             waiting[key] = message
-        elif isinstance(message, LengthEstimate):
+        else:
             if (seen := waiting.pop(key, None)) is not None:
                 row = frames_row(seen, message.is_frame_used, message.frame_reason)
                 frames[f"{key[0]},{key[1]}"] = row

@@ -153,9 +153,14 @@ def test_a_recording_that_nothing_sums_up_is_read(out: Path):
     assert len(lines) == 2  # and nothing else is found
     for name in ("recording.mcap", "recording.rrd"):
         assert any(f"length_mm is 999.0, {name} says" in line for line in lines)
+    whole = bytearray((out / "recording.mcap").read_bytes())
+    whole[400] ^= 1  # of the settings, before the messages
+    (out / "recording.mcap").write_bytes(whole)
     with (out / "recording.rrd").open("r+b") as file:
         file.truncate(len((out / "recording.rrd").read_bytes()) // 2)
-    assert any(line.startswith("recording.rrd: ") for line in changed(out))
+    lines = changed(out)
+    for name in ("recording.mcap", "recording.rrd"):
+        assert any(line.startswith(f"{name}: ") for line in lines)
 
 
 def test_another_runs_recording(out: Path, tmp_path: Path):
