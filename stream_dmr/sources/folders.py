@@ -245,9 +245,9 @@ class ClipFolder(Source):
                 self._on_notice(f"{path.name}: grew after its {done} frames were read")
             clip.is_begun = True
             clip.state = _state_of(path) or _FileState(num_bytes=0, modified_ns=0)
-            self._video = self._open(path)
-            if self._video is None:
+            if (video := self._open(path)) is None:
                 continue
+            self._video = video
             self._clip_s = (self._video.num_frames or 0) / self._video.fps
             ended_ns = self._ended_ns(path)
             start_ns = ended_ns - round(self._clip_s * 1e9)

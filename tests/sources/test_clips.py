@@ -242,6 +242,21 @@ def test_a_clip_that_is_renamed_after_it_was_read_is_not_read_again(tmp_path: Pa
     assert numbers([*folder]) == [5, 6]
 
 
+def test_a_clip_that_is_renamed_while_another_is_left_out_is_not_read_again(tmp_path: Path):
+    clip(tmp_path / "1.avi", first=1)
+    clip(tmp_path / "2.avi", first=2, size=(32, 24))
+    folder, notices = ClipFolder(tmp_path, AT_ONCE), list[str]()
+
+    def rename(line: str) -> None:
+        notices.append(line)
+        if "left out" in line:
+            (tmp_path / "1.avi").rename(tmp_path / "7.avi")
+
+    folder.listen(rename)
+    assert numbers([*folder]) == [1, 2, 3, 4]
+    assert notices[1:] == ["7.avi: is 1.avi by another name, so is not read again"]
+
+
 def test_only_the_clip_that_was_read_is_not_read_by_another_name(tmp_path: Path):
     """Its old name may be another's by now; another that is as large and old was there before."""
     for number in (1, 2):
