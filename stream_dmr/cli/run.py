@@ -1,6 +1,5 @@
 """The commands that measure: `run`, `demo`, `setup`, `recover`."""
 
-import itertools
 import os
 import shlex
 import sys
@@ -15,8 +14,6 @@ import typer
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, importing, stop_on_signals
 from stream_dmr.errors import OutputError
 from stream_dmr.pipeline.run_options import KeyOption, RunOptions
-
-_MAX_NAMED = 4  # recordings of a camera, at the end
 
 
 def run(
@@ -57,9 +54,8 @@ def _measure(
             print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
         is_complete = truth is None or print_beside_truth(request.out / "lengths.csv", truth)
         # A camera's run continues after it has lost a file, and reports that.
-        found = [sorted(at.name for at in request.out.glob(path.name)) for path in summary.files]
-        few = (some if len(some) <= _MAX_NAMED else [f"{len(some)} recordings"] for some in found)
-        names = itertools.chain.from_iterable(few)
+        found = {path.name: len([*request.out.glob(path.name)]) for path in summary.files}
+        names = [name if n == 1 else f"{n} files {name}" for name, n in found.items() if n]
         print(f"results in {request.out}: {', '.join(names)}")
     stop.exit()
     return is_complete

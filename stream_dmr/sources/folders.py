@@ -389,7 +389,8 @@ class ClipFolder(Source):
             elif now - waiting_since >= pause_s and not is_pausing:
                 is_pausing = True
                 self._on_pause()
-            self._closing.wait(max(_POLL_S, (now - began) / _MAX_POLL_SHARE))
+            wait_s = max(_POLL_S, (now - began) / _MAX_POLL_SHARE)
+            self._closing.wait(min(wait_s, _SETTLE_S))
         return None
 
 
