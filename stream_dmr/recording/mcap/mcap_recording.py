@@ -102,7 +102,7 @@ class McapRecording:
         index = None if is_whole else self._index
         if index is not None:
             selection = selection.narrowed_to(index.tracks)
-            if not index.has_any(selection):
+            if not index.has_any(topics, selection):
                 return  # without opening it: one of the thousands of a camera
         with self._open() as stream:
             if index is None:
@@ -262,13 +262,16 @@ def _by_index(
 class _Index:
     """What the end of a file says of its messages."""
 
+    topics: frozenset[str]  # of all its messages
     first_ns: int  # capture times
     last_ns: int
     tracks: Spans | None  # None if the file has no such record
 
-    def has_any(self, selection: Selection) -> bool:
-        """False if no message is of the selected time."""
+    def has_any(self, topics: Iterable[str], selection: Selection) -> bool:
+        """False if no message is of these topics and of the selected time."""
         first, last = selection.bounds_ns
+        if self.topics.isdisjoint(topics):
+            return False
         return (first is None or first <= self.last_ns) and (last is None or self.first_ns < last)
 
 
@@ -278,7 +281,9 @@ def _read_index(stream: IO[bytes]) -> _Index:
     summary = SeekingReader(stream, validate_crcs=True).get_summary()
     if summary is None or summary.statistics is None:
         raise ValueError("its index has no statistics")
+    counts = summary.statistics.channel_message_counts
     return _Index(
+        topics=frozenset(summary.channels[n].topic for n, count in counts.items() if count),
         first_ns=summary.statistics.message_start_time,
         last_ns=summary.statistics.message_end_time,
         tracks=_spans(stream, summary.attachment_indexes),
