@@ -1,8 +1,10 @@
 """Watched time and measured share by haul, to divide counts of fish by."""
 
-from collections import Counter
+from bisect import bisect_right
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,23 +39,34 @@ def read_effort(
     hauls = hauls_of(read_rows(database, HAULS))
     rows = read_rows(database, WATCHED)
     watched = [row for row in rows if span is None or span.includes(row["last_ns"])]
+    fish_of, parts = defaultdict[str, list[Fish]](list), defaultdict[str, list[_Part]](list)
+    for caught in fish:
+        fish_of[caught.haul].append(caught)
+    has_fates = any(caught.fate is not None for caught in fish)
+    efforts = list[HaulEffort]()
     if hauls:
-        efforts = list[HaulEffort]()
-        for name in dict.fromkeys(haul.name for haul in hauls):
-            named = [haul for haul in hauls if haul.name == name]  # it may begin again after others
-            effort = _effort(name, watched, [_overlap(row, named) for row in watched], fish)
-            began_ns, ended_ns = named[0].began_ns, named[-1].ended_ns
+        spans, outside = dict[str, tuple[int, int | None]](), list[_Part]()
+        for haul in hauls:  # one may begin again after others
+            began_ns, _ = spans.get(haul.name, (haul.began_ns, None))
+            spans[haul.name] = began_ns, haul.ended_ns
+        for row in watched:
+            covered, whole_ns = _covered(row, hauls)
+            for name, covered_ns in covered.items():
+                parts[name].append((row, covered_ns / whole_ns))
+            outside.append((row, 1.0 - covered.total() / whole_ns))
+        for name, (began_ns, ended_ns) in spans.items():
+            effort = _effort(name, parts[name], fish_of[name], has_fates=has_fates)
             efforts.append(replace(effort, began_ns=began_ns, ended_ns=ended_ns))
-        shares = [1.0 - _overlap(row, hauls) for row in watched]
-        outside = _effort("", watched, shares, fish)
-        if outside.num_fish or outside.hours_watched > 1e-3:
-            efforts.append(outside)
+        between = _effort("", outside, fish_of[""], has_fates=has_fates)
+        if between.num_fish or between.hours_watched > 1e-3:
+            efforts.append(between)
         return efforts
     by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
-    efforts = list[HaulEffort]()
+    for row in watched:
+        if (name := by_run.get(row["run_id"])) is not None:
+            parts[name].append((row, 1.0))
     for name in dict.fromkeys(by_run.values()):
-        shares = [float(by_run.get(row["run_id"]) == name) for row in watched]
-        effort = _effort(name, watched, shares, fish)
+        effort = _effort(name, parts[name], fish_of[name], has_fates=has_fates)
         of_haul = [row for row in rows if name and by_run.get(row["run_id"]) == name]
         began_ns = min((row["first_ns"] for row in of_haul), default=None)
         ended_ns = max((row["last_ns"] for row in of_haul), default=None)
@@ -66,22 +79,23 @@ def watched_times(database: Path) -> list[int]:
     return [row[end] for row in read_rows(database, WATCHED) for end in ("first_ns", "last_ns")]
 
 
+_Part = tuple[Mapping[str, Any], float]
+"""A row of `watched`, and the share of its time that counts, 0 to 1."""
+
+
 def _effort(
-    name: str, watched: Sequence[Mapping[str, Any]], shares: Sequence[float], fish: Sequence[Fish]
+    name: str, parts: Sequence[_Part], fish: Sequence[Fish], *, has_fates: bool
 ) -> HaulEffort:
-    """`shares` (for each row of `watched`, 0 to 1): the part of each watched time in the haul."""
-    parts = list(zip(watched, shares, strict=True))
+    """The effort of one haul, by its part of the watched time and its fish."""
     frames = sum(row["frames"] * share for row, share in parts)
     lost = sum(row["frames_lost"] * share for row, share in parts)
-    of_haul = [caught for caught in fish if caught.haul == name]
-    has_fates = any(caught.fate is not None for caught in fish)
     return HaulEffort(
         haul=name,
         hours_watched=sum((_hours(row) * share for row, share in parts), start=0.0),
         share_measured=frames / (frames + lost) if frames + lost else None,
-        num_fish=len(of_haul),
-        num_measured=sum(caught.length_mm is not None for caught in of_haul),
-        fates=Counter(caught.fate for caught in of_haul if caught.fate) if has_fates else None,
+        num_fish=len(fish),
+        num_measured=sum(caught.length_mm is not None for caught in fish),
+        fates=Counter(caught.fate for caught in fish if caught.fate) if has_fates else None,
     )
 
 
@@ -89,13 +103,13 @@ def _hours(row: Mapping[str, Any]) -> float:
     return (row["last_ns"] - row["first_ns"]) / _HOUR_NS
 
 
-def _overlap(row: Mapping[str, Any], hauls: Sequence[Haul]) -> float:
-    """The share of a watched time that lies in hauls."""
-    span_ns = row["last_ns"] - row["first_ns"]
-    if span_ns <= 0:
-        return float(any(haul.includes(row["first_ns"]) for haul in hauls))
-    covered = 0
-    for haul in hauls:
-        end_ns = row["last_ns"] if haul.ended_ns is None else min(row["last_ns"], haul.ended_ns)
-        covered += max(0, end_ns - max(row["first_ns"], haul.began_ns))
-    return covered / span_ns
+def _covered(row: Mapping[str, Any], hauls: Sequence[Haul]) -> tuple[Counter[str], int]:
+    """How much of a watched time lies in each haul, by name, and its whole length, ns."""
+    first_ns = row["first_ns"]
+    last_ns = max(row["last_ns"], first_ns + 1)  # one frame is a moment
+    covered = Counter[str]()
+    begins = partial(bisect_right, hauls, key=lambda haul: haul.began_ns)
+    for haul in hauls[max(0, begins(first_ns) - 1) : begins(last_ns)]:
+        end_ns = last_ns if haul.ended_ns is None else min(last_ns, haul.ended_ns)
+        covered[haul.name] += max(0, end_ns - max(first_ns, haul.began_ns))
+    return covered, last_ns - first_ns

@@ -1,7 +1,7 @@
 """Hauls, positions and the track of the vessel."""
 
 import sqlite3
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -42,8 +42,9 @@ def hauls_of(rows: Iterable[Mapping[str, Any]]) -> list[Haul]:
 
 
 def haul_at(hauls: Sequence[Haul], timestamp_ns: int) -> str:
-    """The name of the haul at a time; "" between hauls."""
-    return next((haul.name for haul in hauls if haul.includes(timestamp_ns)), "")
+    """The name of the haul at a time; "" between hauls. `hauls` are as of `hauls_of`."""
+    index = bisect_right(hauls, timestamp_ns, key=lambda haul: haul.began_ns) - 1
+    return hauls[index].name if index >= 0 and hauls[index].includes(timestamp_ns) else ""
 
 
 def next_name(hauls: Iterable[Haul]) -> str:

@@ -1,11 +1,13 @@
 """Hauls: what events make of them, and the effort that counts are divided by."""
 
 import time
+from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +20,7 @@ from stream_dmr.pipeline.haul_log import HaulLog, write_haul
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import HAULS, NAME, read_rows
+from stream_dmr.store.schema import HAULS, NAME, WATCHED, read_rows
 from stream_dmr.store.trip import haul_at, haul_values, hauls_of
 from tests.support.final_estimates import FACTS, fish
 
@@ -40,7 +42,8 @@ def test_hauls_never_overlap(events: list[tuple[str, int]]):
         assert before.ended_ns is not None
         assert before.began_ns <= before.ended_ns <= after.began_ns
     for time_ns in range(51):
-        assert sum(haul.includes(time_ns) for haul in hauls) <= 1
+        names = [haul.name for haul in hauls if haul.includes(time_ns)]
+        assert [haul_at(hauls, time_ns)] == (names or [""])
 
 
 def test_a_fish_belongs_to_the_haul_of_its_middle():
@@ -92,6 +95,26 @@ def test_a_haul_that_is_begun_again_has_only_its_own_times(tmp_path: Path):
     hours = {name: 3600 * effort.hours_watched for name, effort in efforts.items()}
     assert hours == pytest.approx({"7": 200, "8": 200, "": 200})
     assert (efforts["7"].began_ns, efforts["7"].ended_ns) == (100 * SECOND, 500 * SECOND)
+
+
+def test_the_hours_of_many_hauls_are_those_counted_minute_by_minute(tmp_path: Path):
+    rng, store = np.random.default_rng(3), LengthStore(tmp_path, FACTS)
+    for number, minute in enumerate(rng.integers(0, 500, 40).tolist()):
+        what = "start" if number % 3 else "end"
+        store.append(HAULS, "x", haul_values(what, str(number % 7), minute * MINUTE, "Ada"))
+    counted = Counter[str]()
+    hauls = hauls_of(read_rows(store.path, HAULS))
+    for first in rng.integers(0, 500, 60).tolist():
+        last = first + int(rng.integers(0, 60))
+        span = {"first_ns": first * MINUTE, "last_ns": last * MINUTE, "frames": 1, "frames_lost": 0}
+        store.append(WATCHED, "x", span)
+        for minute in range(first, last):
+            within = (one.name for one in hauls if one.includes(minute * MINUTE))
+            counted[next(within, "")] += 1
+    store.close()
+    hours = {one.haul: 60 * one.hours_watched for one in read_effort(store.path, [])}
+    assert hours == pytest.approx({name: counted[name] for name in hours})
+    assert sum(hours.values()) == pytest.approx(counted.total())
 
 
 def test_a_haul_that_a_command_began_after_the_last_frame_ends_by_the_button(tmp_path: Path):
