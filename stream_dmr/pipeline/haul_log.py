@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import seal_hauls
@@ -43,6 +44,7 @@ class HaulLog:
         self._pause_ns = round(settings.pause_min * 60e9)
         self._fast_knots = settings.end_speed_knots or float("inf")
         self._lock = threading.RLock()
+        self._rows: list[dict[str, Any]] = []  # of `hauls`, to which rows are only added
         self._known: list[Haul] = []
         self._ruled: str | None = None  # the haul that the rule began and has not ended
         self._last_fish_ns = 0
@@ -57,8 +59,8 @@ class HaulLog:
     def _take_over(self) -> None:
         """Go on with a haul that the rule began and a crash left open: nobody else would end it."""
         with suppress(OutputError):
-            haul, rows = self.current(), read_rows(self._store.path, HAULS)
-            ruled = {row["timestamp_ns"] for row in rows if row["said_by"] == _RULE}
+            haul = self.current()
+            ruled = {row["timestamp_ns"] for row in self._rows if row["said_by"] == _RULE}
             if haul is not None and haul.began_ns in ruled:
                 lasts = (fish.last_timestamp_ns for fish in self._store.estimates())
                 self._ruled, self._last_fish_ns = haul.name, max([haul.began_ns, *lasts])
@@ -66,7 +68,10 @@ class HaulLog:
     def hauls(self) -> list[Haul]:
         """All hauls of the folder so far, also those that other programs wrote into it."""
         with self._lock, suppress(OutputError):
-            self._known = hauls_of(read_rows(self._store.path, HAULS))
+            after = self._rows[-1]["number"] if self._rows else 0
+            if told := self._store.rows(HAULS, after=after):
+                self._rows += told
+                self._known = hauls_of(self._rows)
         return self._known
 
     def current(self) -> Haul | None:

@@ -1,5 +1,6 @@
 """Frees disk space by deleting the oldest recordings, step by step; lengths are never deleted."""
 
+import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
@@ -82,16 +83,22 @@ class Retention:
         """Delete step by step, and yield the name of each deleted part for the notice."""
         for table in rotated_files(self.folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
-        recordings = [*self.folder.glob(f"{STEM}-*.mcap"), *self.folder.glob(f"{STEM}-*.rrd")]
-        stems = {path.with_suffix("") for path in recordings}
-        stems = sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
-        flagged = set(self.flagged())
-        has_flagged = {stem: bool(flagged & set(self._facts(stem)[0])) for stem in stems}
+        # Of weeks there are tens of thousands: each is looked at when it is its turn.
+        there = set(os.listdir(self.folder))
+        names = [name for name in there if name.startswith(f"{STEM}-")]
+        names = {name.rpartition(".")[0] for name in names if name.endswith((".mcap", ".rrd"))}
+        stems = sorted(map(self.folder.joinpath, names), key=natural_order)
+        flagged = frozenset(self.flagged())
         for flag in (False, True):
-            group = [stem for stem in stems if has_flagged[stem] is flag]
-            for stem in group:
-                yield from self._remove(stem.with_suffix(".rrd"), "the view")
-                yield from self._thin(stem.with_suffix(".mcap"))
+            group = list[Path]()
+            for stem in stems:
+                if _is_open(stem, there) or flagged.isdisjoint(self._facts(stem)[0]) is flag:
+                    continue
+                group.append(stem)
+                if f"{stem.name}.rrd" in there:
+                    yield from self._remove(stem.with_suffix(".rrd"), "the view")
+                if not self._facts(stem)[1]:
+                    yield from self._thin(stem.with_suffix(".mcap"))
             for stem in group:
                 yield from self._remove(stem.with_suffix(".mcap"), "all")
 
@@ -113,9 +120,7 @@ class Retention:
 
     def _thin(self, path: Path) -> Iterator[str]:
         """Remove pictures and masks; without room for the copy, do nothing."""
-        tracks, is_thinned = self._facts(path.with_suffix(""))
-        if is_thinned:
-            return
+        tracks, _ = self._facts(path.with_suffix(""))
         with suppress(OSError, RecordingError):
             copy, _ = rewrite(path, note=THINNED, edit=partial(_thinned, PhotographChooser()))
             rename_durably(copy, path)
@@ -124,10 +129,11 @@ class Retention:
             yield "pictures and masks"
 
 
-def _is_open(stem: Path) -> bool:
+def _is_open(stem: Path, there: Collection[str]) -> bool:
+    """True for a segment that is written to; `there`: the names that its folder had just now."""
     rrd = stem.with_suffix(".rrd")
-    has_part = stem.with_name(f"{stem.name}.mcap{PART}").exists()
-    return has_part or (rrd.exists() and not is_closed(rrd))
+    has_view = rrd.name in there and rrd.exists()
+    return f"{stem.name}.mcap{PART}" in there or (has_view and not is_closed(rrd))
 
 
 def _thinned(chooser: PhotographChooser, topic: str, data: bytes) -> bytes | None:

@@ -4,7 +4,6 @@ from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,8 +107,10 @@ def _covered(row: Mapping[str, Any], hauls: Sequence[Haul]) -> tuple[Counter[str
     first_ns = row["first_ns"]
     last_ns = max(row["last_ns"], first_ns + 1)  # one frame is a moment
     covered = Counter[str]()
-    begins = partial(bisect_right, hauls, key=lambda haul: haul.began_ns)
-    for haul in hauls[max(0, begins(first_ns) - 1) : begins(last_ns)]:
+    first, end = (
+        bisect_right(hauls, t, key=lambda haul: haul.began_ns) for t in (first_ns, last_ns)
+    )
+    for haul in hauls[max(0, first - 1) : end]:
         end_ns = last_ns if haul.ended_ns is None else min(last_ns, haul.ended_ns)
         covered[haul.name] += max(0, end_ns - max(first_ns, haul.began_ns))
     return covered, last_ns - first_ns

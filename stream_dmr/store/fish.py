@@ -321,8 +321,10 @@ def rows_by_run(database: Path, table: Table) -> dict[str, list[str]]:
 def flagged_fish(out_dir: Path) -> set[int]:
     """The ids of fish whose length has a flag. Raises OutputError if they can't be read."""
     path = out_dir / NAME
-    stored = read_rows(path, FISH) if path.exists() else []
-    return {row["track_id"] for row in stored if row["flags"] != "[]"}
+    if not path.exists():
+        return set()
+    with reading(path) as database:
+        return {i for (i,) in database.execute("SELECT track_id FROM fish WHERE flags != '[]'")}
 
 
 def _run_of(row: Mapping[str, Any]) -> RunFacts:

@@ -8,12 +8,12 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
-from typing import Literal
+from typing import Any, Literal
 from uuid import uuid4
 
 from stream_dmr.errors import OutputError
@@ -366,11 +366,25 @@ class LengthStore:
             entries = read_chain(self._rows.database)
         return {entry.name for entry in entries if entry.kind in FILE_KINDS}
 
-    def estimates(self) -> list[LengthEstimate]:
-        """The finished fish of this folder, in the order in which tracks ended."""
+    def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
+        """The finished fish of this folder, in the order in which tracks ended.
+
+        `last`: only so many of them, the last.
+        """
+        with self._querying() as database:
+            (count,) = database.execute("SELECT MAX(number) FROM fish").fetchone()
+            return read_estimates(database, after=(count or 0) - last if last else None)
+
+    def rows(self, table: Table, *, after: int) -> list[dict[str, Any]]:
+        """The rows of a table whose number is higher, also those of other programs."""
+        with self._querying() as database:
+            return list(rows(database, table, after=after))
+
+    @contextmanager
+    def _querying(self) -> Generator[sqlite3.Connection]:
         with self._lock:
             try:
-                return read_estimates(self._rows.database)
+                yield self._rows.database
             except sqlite3.Error as error:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths, got: {error}; make room, or "
@@ -382,6 +396,13 @@ class LengthStore:
         query = "SELECT track_id, flags FROM fish WHERE flags != '[]'"
         with self._lock:
             return {i: json.loads(flags) for i, flags in self._rows.database.execute(query)}
+
+    def flags_of(self, track_id: int) -> list[str]:
+        """The flags of a finished fish; none if it is not there."""
+        query = "SELECT flags FROM fish WHERE track_id = ?"
+        with self._lock:
+            row = self._rows.database.execute(query, (track_id,)).fetchone()
+        return [] if row is None else json.loads(row[0])
 
     def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
         """The number of finished fish by the value of a column, without fish that have none."""

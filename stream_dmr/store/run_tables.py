@@ -77,7 +77,7 @@ class LengthsTable:
         try:
             while self._waiting:
                 estimate = self._waiting[0]
-                flags = self._store.flags().get(estimate.track_id, ())
+                flags = self._store.flags_of(estimate.track_id)
                 self._rows.add(lengths_row(estimate, flags))
                 self._waiting.popleft()
             self.trouble = ""

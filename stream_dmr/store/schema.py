@@ -216,15 +216,18 @@ def _columns(database: sqlite3.Connection, table: str) -> _Columns:
     return {name: (kind, not (required or key)) for _, name, kind, required, _, key in found}
 
 
-def rows(database: sqlite3.Connection, table: Table) -> Iterator[dict[str, Any]]:
+def rows(
+    database: sqlite3.Connection, table: Table, *, after: int | None = None
+) -> Iterator[dict[str, Any]]:
     """The rows in their order, by column: None in columns that are missing.
 
-    There are none if the table is missing.
+    `after`: only rows whose number is higher. There are none if the table is missing.
     """
     present = _columns(database, table.name)
     names = [n for n, (_, is_optional) in table.columns.items() if n in present or not is_optional]
     if present:
-        query = f"SELECT {', '.join(names)} FROM {table.name} ORDER BY {table.order}"
+        which = "" if after is None else f"WHERE number > {after:d} "
+        query = f"SELECT {', '.join(names)} FROM {table.name} {which}ORDER BY {table.order}"
         for row in database.execute(query):
             yield dict.fromkeys(table.columns) | dict(zip(names, row, strict=True))
 
@@ -506,9 +509,11 @@ def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object
     }
 
 
-def read_estimates(database: sqlite3.Connection) -> list[LengthEstimate]:
-    """The final estimates; the recordings have their smoothed series."""
-    return [estimate_of(row) for row in rows(database, FISH)]
+def read_estimates(
+    database: sqlite3.Connection, *, after: int | None = None
+) -> list[LengthEstimate]:
+    """The final estimates, see `rows`; the recordings have their smoothed series."""
+    return [estimate_of(row) for row in rows(database, FISH, after=after)]
 
 
 def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:

@@ -98,7 +98,7 @@ class RunState:
             self.num_fish[without_counts(status)] += number
         self.species.update(store.counts("species_code"))
         self.fates.update(store.counts("fate"))
-        self.finished.extend(store.estimates())
+        self.finished.extend(store.estimates(last=MAX_FINISHED))
 
     def take(self, message: Message) -> None:
         """Keep the parts of a message that the page shows; pictures are not copied."""

@@ -85,9 +85,11 @@ def test_what_is_read_back_gives_the_same_rows(tmp_path_factory, entries, again:
     if again:
         store.close()
         store = LengthStore(folder, FACTS)
-    read = store.estimates()
+    read, last = store.estimates(), store.estimates(last=2)
+    assert {e.track_id: store.flags_of(e.track_id) for e in read} == store.flags()
     store.close()
     assert [lengths_row(e) for e in read] == [lengths_row(e) for e in written]
+    assert [lengths_row(e) for e in last] == [lengths_row(e) for e in written[-2:]]
     assert [e.refused for e in read] == [e.refused for e in written]
 
 
