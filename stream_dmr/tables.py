@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -185,8 +186,13 @@ def cell(value: object) -> str:
 
 def cells(row: type, message: object, **others: object) -> list[str]:
     """The cells of a row class: attributes of the message of these names, but for `others`."""
-    names = get_type_hints(row)
+    names = _names(row)
     return [cell(others[name] if name in others else getattr(message, name)) for name in names]
+
+
+@cache
+def _names(row: type) -> tuple[str, ...]:
+    return tuple(get_type_hints(row))
 
 
 def column_kinds(row: type) -> dict[str, type]:

@@ -516,6 +516,10 @@ def read_estimates(
     return [estimate_of(row) for row in rows(database, FISH, after=after)]
 
 
+_NO_FRAMES, _NO_LENGTHS = np.zeros(0, np.int64), np.zeros(0)
+_NO_FRAMES.flags.writeable = _NO_LENGTHS.flags.writeable = False  # shared by a hundred thousand
+
+
 def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
     """The final estimate of a row of `fish`, without its smoothed series."""
     low, high = row["ci95_low_mm"], row["ci95_high_mm"]
@@ -530,7 +534,7 @@ def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
         is_final=True,
         is_frame_used=False,
         frame_reason="",
-        smoothed_frames=np.zeros(0, np.int64),
-        smoothed_mm=np.zeros(0),
-        smoothed_std_mm=np.zeros(0),
+        smoothed_frames=_NO_FRAMES,
+        smoothed_mm=_NO_LENGTHS,
+        smoothed_std_mm=_NO_LENGTHS,
     )
