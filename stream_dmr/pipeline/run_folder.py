@@ -24,7 +24,7 @@ from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import write_lengths
-from stream_dmr.store.schema import NAME, open_for_reading, read_estimates
+from stream_dmr.store.schema import FISH, NAME, column_values, open_for_reading
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
@@ -159,21 +159,22 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
         yield repair.line
     if not (folder / NAME).exists():
         return
+    with closing(open_for_reading(folder / NAME)) as database:
+        stored = set(column_values(database, FISH, "track_id"))
     for path in sorted(folder.glob("*.mcap")):
-        yield from _add_lengths(path, folder, signer)
+        yield from _add_lengths(path, folder, signer, stored)
     if key is not None:
         sign_found(folder, [repair.path for repair in repairs], signer)
 
 
-def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
+def _add_lengths(path: Path, folder: Path, signer: Signer, stored: set[int]) -> Iterator[str]:
+    """Add the lengths that `stored` lacks, and their ids to it."""
     try:
         recording = open_recordings([path])
         final = [length for length in messages_of(recording, LengthEstimate) if length.is_final]
     except RecordingError as error:
         yield str(error)
         return
-    with closing(open_for_reading(folder / NAME)) as database:
-        stored = {estimate.track_id for estimate in read_estimates(database)}
     missing = [estimate for estimate in final if estimate.track_id not in stored]
     if not missing:
         return
@@ -185,5 +186,6 @@ def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
         store.end(f"not by itself: its lengths are {FROM_RECORDING}")
         for estimate in missing:
             store.add(estimate, flags=[FROM_RECORDING])
+            stored.add(estimate.track_id)
             yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"
         write_lengths(folder / "lengths.csv", store.estimates(), store.flags())

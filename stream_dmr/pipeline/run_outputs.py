@@ -297,7 +297,7 @@ def interrupted_tracks(
         torn = _segments(store.path.parent, "mcap")[:1]
     if not torn:
         return []
-    finished = {estimate.track_id for estimate in store.estimates()}
+    finished = store.track_ids()
     try:
         return list(unfinished_frames(open_recordings(torn), finished=finished))
     except RecordingError as error:

@@ -81,7 +81,9 @@ class Signer:
 
     def continue_chain(self, database: sqlite3.Connection) -> None:
         if self._key is not None:
-            self._last = next(reversed(read_chain(database)), None)
+            (number,) = database.execute("SELECT MAX(number) FROM chain").fetchone()
+            last = records(database, LEDGER, ChainEntry, after=(number or 0) - 1)
+            self._last = last[0] if last else None
 
     def row(self, kind: str, name: str, values: Mapping[str, object]) -> list[Statement]:
         return self.content(kind, name, content_sha256(values)) if self._key else []

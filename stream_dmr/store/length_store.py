@@ -19,7 +19,7 @@ from uuid import uuid4
 from stream_dmr.errors import OutputError
 from stream_dmr.files import FolderLock, ReservedSpace
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.store.ledger import END, FILE_KINDS, STATE, Signer, lines_sha256, read_chain
+from stream_dmr.store.ledger import END, FILE_KINDS, STATE, Signer, lines_sha256
 from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
     CHECKS,
@@ -36,6 +36,7 @@ from stream_dmr.store.schema import (
     Statement,
     Table,
     check_lines,
+    column_values,
     copy_in_memory,
     fish_row,
     insertion,
@@ -362,9 +363,9 @@ class LengthStore:
 
     def signed_files(self) -> set[str]:
         """The names of all files that were ever signed here."""
+        query = "SELECT DISTINCT name FROM chain WHERE kind IN (?, ?, ?)"
         with self._lock:
-            entries = read_chain(self._rows.database)
-        return {entry.name for entry in entries if entry.kind in FILE_KINDS}
+            return {name for (name,) in self._rows.database.execute(query, FILE_KINDS)}
 
     def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
         """The finished fish of this folder, in the order in which tracks ended.
@@ -374,6 +375,11 @@ class LengthStore:
         with self._querying() as database:
             (count,) = database.execute("SELECT MAX(number) FROM fish").fetchone()
             return read_estimates(database, after=(count or 0) - last if last else None)
+
+    def track_ids(self) -> set[int]:
+        """The ids of the finished fish of this folder."""
+        with self._querying() as database:
+            return set(column_values(database, FISH, "track_id"))
 
     def rows(self, table: Table, *, after: int) -> list[dict[str, Any]]:
         """The rows of a table whose number is higher, also those of other programs."""

@@ -232,10 +232,21 @@ def rows(
             yield dict.fromkeys(table.columns) | dict(zip(names, row, strict=True))
 
 
-def records(database: sqlite3.Connection, table: Table, kind: type[T]) -> list[T]:
-    """The rows as objects of a dataclass whose fields are columns."""
+def column_values(database: sqlite3.Connection, table: Table, column: str) -> Iterator[Any]:
+    """The values of a required column; none if the table is missing."""
+    if _columns(database, table.name):
+        for (value,) in database.execute(f"SELECT {column} FROM {table.name}"):
+            yield value
+
+
+def records(
+    database: sqlite3.Connection, table: Table, kind: type[T], *, after: int | None = None
+) -> list[T]:
+    """The rows, see `rows`, as objects of a dataclass whose fields are columns."""
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    return [kind(**{name: row[name] for name in names}) for row in rows(database, table)]
+    return [
+        kind(**{name: row[name] for name in names}) for row in rows(database, table, after=after)
+    ]
 
 
 @contextmanager

@@ -29,7 +29,15 @@ from stream_dmr.store.fish import Fish, read_measured_fish, read_runs
 from stream_dmr.store.ledger import Signer, read_chain
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import last_checks
-from stream_dmr.store.schema import EVENTS, FISH, WATCHED, flags_in_status, read_rows, reading
+from stream_dmr.store.schema import (
+    EVENTS,
+    FISH,
+    WATCHED,
+    column_values,
+    flags_in_status,
+    read_rows,
+    reading,
+)
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.trip import Haul, VesselTrack, read_positions, thinned
 from stream_dmr.tables import utc_text
@@ -90,16 +98,18 @@ def write_digest(
 
 def _days(database: Path) -> tuple[Counter[date], int]:
     """The number of fish of each watched UTC day, and the offset of UTC to capture times, ns."""
-    zeros, found = [facts.utc_zero_ns for facts in read_runs(database).values()], Counter[date]()
+    zeros = [facts.utc_zero_ns for facts in read_runs(database).values()]
     if not zeros or (zero_ns := zeros[-1]) is None:
         raise OutputError(
             f"{database.parent}: expected a run that knows the time of day, got one that does not; "
             "measure with --start-utc"
         )
-    for table, column, count in ((WATCHED, "last_ns", 0), (FISH, "last_timestamp_ns", 1)):
-        for row in read_rows(database, table):
-            found[_day_of(row[column] + zero_ns)] += count
-    return found, zero_ns
+    days = Counter[int]()  # since 1970
+    with reading(database) as connection:
+        for table, column, count in ((WATCHED, "last_ns", 0), (FISH, "last_timestamp_ns", 1)):
+            for moment_ns in column_values(connection, table, column):
+                days[(moment_ns + zero_ns) // _DAY_NS] += count
+    return Counter({_EPOCH + timedelta(days=day): num for day, num in days.items()}), zero_ns
 
 
 def _day_of(utc_ns: int) -> date:

@@ -89,9 +89,8 @@ class ReviewQueue:
 
     def detail(self, run: int, track_id: int) -> dict[str, Any]:
         """The details that a row opens. UserError without such a fish."""
-        for fish, _ in self._fish(run):
-            if fish.estimate.track_id == track_id:
-                return fish_detail(fish, self._recorder(run).report)
+        for fish, _ in self._fish(run, {track_id}):
+            return fish_detail(fish, self._recorder(run).report)
         raise UserError(f"expected a fish of this review, got {track_id}")
 
     def clip(self, run: int, track_id: int, shift: int) -> Iterator[bytes]:
