@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.evidence.seal import SignedFiles, sealed
-from stream_dmr.files import natural_order
+from stream_dmr.files import free_bytes, natural_order
 from stream_dmr.fitting.shape.stocks import MAX_FISH
 from stream_dmr.messages import (
     FishCrop,
@@ -36,7 +36,7 @@ from stream_dmr.recording.record import Record, SinkStates
 from stream_dmr.recording.recorder import STEM, Recorder, open_recording_files
 from stream_dmr.recording.repair import Repair
 from stream_dmr.recording.retention import Retention
-from stream_dmr.recording.segments import open_segments, unfinished_frames
+from stream_dmr.recording.segments import MIN_FREE_SHARE, open_segments, unfinished_frames
 from stream_dmr.recording.selection import Selection
 from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.sources.source import ResumePoint, Source
@@ -407,7 +407,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
 
 
 def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
-    """Make room before anything of the run is written; the Retention that keeps it, not started."""
+    """Make room for the first writes of the run; the Retention that makes the rest, not started."""
     out, keep_free_gb = inputs.request.out, inputs.config.recording.keep_free_gb
     retention = Retention(
         out,
@@ -416,8 +416,10 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
         on_notice=observer.warn,
         on_changed=files.changed,
     )
-    with suppress(OSError, OutputError):  # it tries again during the run
-        retention.free_space()
+    # It goes on during the run: to find what may go of weeks of segments takes a while.
+    with suppress(OSError, OutputError):
+        if free_bytes(out) < MIN_FREE_SHARE * retention.free_bytes:
+            retention.free_space()
     return retention
 
 

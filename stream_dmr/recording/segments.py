@@ -120,7 +120,7 @@ class UnfinishedFiles:
 
 _NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
 _RETRY_NS = 5_000_000_000  # capture time after which a new segment is tried again
-_MIN_FREE_SHARE = 0.05  # of `keep_free_gb`: with less than that free only lengths are written
+MIN_FREE_SHARE = 0.05  # of `keep_free_gb`: with less than that free only lengths are written
 _NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths"
 
 
@@ -153,7 +153,7 @@ class SegmentFiles:
             free = free_bytes(self.out_dir)
         except OSError:  # open files can still be written to; the next segment reports the problem
             return False
-        return free < _MIN_FREE_SHARE * self.settings.keep_free_gb * 1e9
+        return free < MIN_FREE_SHARE * self.settings.keep_free_gb * 1e9
 
     def open_next(self) -> list[FileSink]:
         """The sinks of the next segment; none if the disk refuses them."""

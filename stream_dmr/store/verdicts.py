@@ -285,10 +285,13 @@ def add_verdict(
     return written[-1]
 
 
-def read_verdicts(path: Path) -> list[Verdict]:
-    """All verdicts of a lengths.db in the order of writing. Raises OutputError."""
+def read_verdicts(path: Path, *, after: int | None = None) -> list[Verdict]:
+    """All verdicts of a lengths.db in the order of writing. Raises OutputError.
+
+    `after`: only those whose number is higher.
+    """
     with reading(path) as database:
-        return records(database, VERDICTS, Verdict)
+        return records(database, VERDICTS, Verdict, after=after)
 
 
 def read_added_frames(path: Path) -> dict[int, list[AddedFrame]]:
@@ -312,5 +315,5 @@ def next_track_id(path: Path) -> int:
 
 def verdict_line(verdict: Verdict) -> str:
     """A verdict as JSON, for checksums."""
-    values = asdict(verdict)
-    return json.dumps({n: v for n, v in values.items() if v is not None or n not in _LATER})
+    values = vars(verdict).items()
+    return json.dumps({n: v for n, v in values if v is not None or n not in _LATER})

@@ -130,6 +130,7 @@ class VerdictRecorder:
         )
         self._editor = TrackEditor(self._database, self.pictures)
         self._lock = Lock()
+        self._known: list[Verdict] = []
 
     def record(self, submitted: SubmittedVerdict) -> list[int]:
         """Check and write a verdict; returns the track ids of the changed fish.
@@ -138,7 +139,7 @@ class VerdictRecorder:
         contradicts measurements but may be right.
         """
         with self._lock:
-            earlier = read_verdicts(self._database)
+            earlier = self._read()
             self._follow(earlier)
             verdict = self._verdict(submitted)
             frames: Sequence[AddedFrame] = ()
@@ -150,23 +151,29 @@ class VerdictRecorder:
             known = len(earlier) if is_edit else None
             add_verdict(self._database, verdict, frames=frames, known=known)
             seal_verdicts(self._database.parent)
-            self._follow(read_verdicts(self._database))
+            self._follow(self._read())
             return sorted({verdict.track_id} | changed_fish(before, self.report.edits))
 
     def last(self) -> Verdict | None:
         """The verdict that an undo would take back; None if there is none."""
-        verdicts = read_verdicts(self._database)
+        with self._lock:
+            verdicts = self._read()
         number = last_of(verdicts, self._reviewer, self._reading)
         return None if number is None else verdicts[number - 1]
 
     def snapshot(self) -> tuple[RunReport, dict[int, Review], set[int]]:
         """The present fish, their reviews, and the ids of all fish that any verdict names."""
         with self._lock:
-            verdicts = read_verdicts(self._database)
+            verdicts = self._read()
             self._follow(verdicts)
             named = {v.track_id for v in verdicts}
             named |= {v.other_fish for v in verdicts if v.other_fish is not None}
             return self.report, self._reviews(verdicts), named
+
+    def _read(self) -> list[Verdict]:
+        """All verdicts so far, also of other reviewers; rows are only added."""
+        self._known += read_verdicts(self._database, after=len(self._known))
+        return [*self._known]
 
     def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
         """The reviews of this reading: a blind reader sees no other verdicts."""
