@@ -96,7 +96,7 @@ class Fish:
     @property
     def species(self) -> Species | None:
         """The species of the bundled list; None if it is not in there, or unknown."""
-        return find_species(self.review.species or self.estimate.species_code or "", load_species())
+        return _bundled_species(self.review.species or self.estimate.species_code or "")
 
     @property
     def species_code(self) -> str | None:
@@ -114,6 +114,11 @@ class Fish:
         """`species_code`, but "" if it is not known or unsure."""
         code = self.species_code
         return "" if code is None or code == UNSURE else code
+
+
+@cache
+def _bundled_species(text: str) -> Species | None:
+    return find_species(text, load_species())
 
 
 def middle_ns(estimate: LengthEstimate) -> int:

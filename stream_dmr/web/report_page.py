@@ -3,7 +3,7 @@
 import math
 import sys
 from base64 import b64encode
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
@@ -117,11 +117,14 @@ def _span(*times: str) -> str:
 
 def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
     """A row of the table for each haul: texts by column heading."""
-    counted = [caught for caught in report.fish if caught.counts]
+    fish_of = defaultdict[str, list[Fish]](list)
+    for caught in report.fish:
+        if caught.counts:
+            fish_of[caught.haul].append(caught)
     zeros = {facts.utc_zero_ns for facts in report.runs}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
     for effort in report.efforts:
-        fish = [caught for caught in counted if caught.haul == effort.haul]
+        fish = fish_of[effort.haul]
         row = haul_row(effort, utc_zero_ns=zero_ns)
         share = effort.share_measured
         lengths = [caught.length_mm for caught in fish if caught.length_mm]
