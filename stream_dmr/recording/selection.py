@@ -27,13 +27,6 @@ class Selection:
     def is_everything(self) -> bool:
         return self.time_ns is None and self.tracks is None
 
-    @property
-    def bounds_ns(self) -> tuple[int | None, int | None]:
-        """First capture time (included) and last capture time (excluded); None: no bound."""
-        if self.time_ns is None:
-            return None, None
-        return self.time_ns[0] - self.lead_ns, self.time_ns[1]
-
     def shifted(self, offset_ns: int) -> "Selection":
         """Its time on another clock, which is ahead by so much, of all tracks."""
         time_ns = None
@@ -42,8 +35,14 @@ class Selection:
         return Selection(time_ns=time_ns)
 
     def includes_time(self, timestamp_ns: int) -> bool:
-        first, last = self.bounds_ns
-        return (first is None or first <= timestamp_ns) and (last is None or timestamp_ns < last)
+        return self.overlaps(timestamp_ns, timestamp_ns)
+
+    def overlaps(self, first_ns: int, last_ns: int) -> bool:
+        """True if a time from the first to the last, both included, may be selected."""
+        if self.time_ns is None:
+            return True
+        begin_ns, end_ns = self.time_ns  # without the last
+        return begin_ns - self.lead_ns <= last_ns and first_ns < end_ns
 
     def includes(self, message: object) -> bool:
         """True for a message of a selected track, and for every frame."""

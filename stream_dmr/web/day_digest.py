@@ -109,7 +109,7 @@ def _days(database: Path) -> tuple[Counter[date], int]:
         for table, column, count in ((WATCHED, "last_ns", 0), (FISH, "last_timestamp_ns", 1)):
             for moment_ns in column_values(connection, table, column):
                 days[(moment_ns + zero_ns) // _DAY_NS] += count
-    return Counter({_EPOCH + timedelta(days=day): num for day, num in days.items()}), zero_ns
+    return Counter({_day_of(day * _DAY_NS): num for day, num in days.items()}), zero_ns
 
 
 def _day_of(utc_ns: int) -> date:

@@ -241,12 +241,12 @@ def _by_index(
     wanted = {
         n: channel.topic for n, channel in summary.channels.items() if channel.topic in topics
     }
-    first, last = selection.bounds_ns
     # The library's own search has all chunks in memory before it gives the first message out.
     for index in summary.chunk_indexes:
-        is_early = first is not None and index.message_end_time < first
-        is_late = last is not None and last <= index.message_start_time
-        if is_early or is_late or wanted.keys().isdisjoint(index.message_index_offsets):
+        has_wanted = not wanted.keys().isdisjoint(index.message_index_offsets)
+        if not has_wanted or not selection.overlaps(
+            index.message_start_time, index.message_end_time
+        ):
             continue
         stream.seek(index.chunk_start_offset + 1 + 8)  # opcode and length
         for record in breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True):
@@ -269,10 +269,9 @@ class _Index:
 
     def has_any(self, topics: Iterable[str], selection: Selection) -> bool:
         """False if no message is of these topics and of the selected time."""
-        first, last = selection.bounds_ns
-        if self.topics.isdisjoint(topics):
-            return False
-        return (first is None or first <= self.last_ns) and (last is None or self.first_ns < last)
+        return not self.topics.isdisjoint(topics) and selection.overlaps(
+            self.first_ns, self.last_ns
+        )
 
 
 def _read_index(stream: IO[bytes]) -> _Index:
