@@ -49,7 +49,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(shutil.copytree(options.folder, Path(place) / "run"))
         began = time.perf_counter()
-        reports, _ = open_folders([folder])
+        reports, _ = open_folders([folder], max_drawn=0)
         server = ReviewServer(ReviewQueue(reports, reviewer="script"), title=options.folder.name)
         served = time.perf_counter()
         tab = Tab(server.address, width=1400, height=1000)

@@ -43,7 +43,9 @@ def review(
         from stream_dmr.web.open_reports import open_folders
         from stream_dmr.web.review_queue import AuditSample, ReviewQueue, ReviewServer
 
-        reports, notes = open_folders(folders, source=source, config=config, as_measured=blind)
+        reports, notes = open_folders(
+            folders, source=source, config=config, as_measured=blind, max_drawn=0
+        )
         for line in notes:
             print(line)
         warn(line for report in reports for line in report.recording.warnings)
@@ -77,7 +79,7 @@ def import_(
     from stream_dmr.web.corrected_tracks import import_tracks
     from stream_dmr.web.open_reports import open_report
 
-    report = open_report(folder, source=source)
+    report = open_report(folder, source=source, max_drawn=0)
     lines, doubts = import_tracks(report, viame, reviewer=reviewer or getuser())
     for line in lines:
         print(line)

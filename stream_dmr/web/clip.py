@@ -13,6 +13,7 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, LocalizedFish
 from stream_dmr.recording.frame_images import FrameLookup
+from stream_dmr.recording.reading import messages_of
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.fish import database_of
@@ -53,12 +54,13 @@ def fish_clip(
 
 def _chunks(report: RunReport, pictures: FrameLookup, span_ns: tuple[int, int]) -> Iterator[bytes]:
     fish = _outlines(report, span_ns)
+    size = _size(report, span_ns)
     for found in pictures.frames(span_ns):
         frame = found.frame
         values = {
             "frame": frame.frame_index,
             "time_ns": str(frame.timestamp_ns),  # text: JavaScript would round it
-            "size": _size(report, frame.image),
+            "size": [frame.image.shape[1], frame.image.shape[0]] if frame.image.size else size,
             "fish": fish.get(frame.frame_index, []),
         }
         for part in (json.dumps(values).encode(), _jpeg(frame.image)):
@@ -90,16 +92,13 @@ def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dic
     return {frame: [by_fish[fish] for fish in sorted(by_fish)] for frame, by_fish in frames.items()}
 
 
-def _size(report: RunReport, image: UInt8[np.ndarray, "H W 3"]) -> list[int]:
-    """Width and height of the frames, px."""
-    if image.size:
-        return [image.shape[1], image.shape[0]]
+def _size(report: RunReport, span_ns: tuple[int, int]) -> list[int]:
+    """Width and height, px, of frames without a picture."""
     calibration = report.recording.header.calibration
     if calibration is not None:
         return [calibration.camera.width, calibration.camera.height]
-    for views in report.views.values():
-        for view in views:
-            return [view.frame_camera.width, view.frame_camera.height]
+    for crop in messages_of(report.recording, FishCrop, Selection(time_ns=span_ns)):
+        return [crop.frame_camera.width, crop.frame_camera.height]
     return [_MAX_WIDTH_PX, _MAX_WIDTH_PX * 9 // 16]
 
 

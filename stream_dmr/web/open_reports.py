@@ -2,16 +2,15 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import add_files
 from stream_dmr.files import make_folder, replace_text
+from stream_dmr.messages import Frame
 from stream_dmr.pipeline.config import load_config, parse_config
-from stream_dmr.recording.frame_images import FrameLookup
-from stream_dmr.recording.reading import require_messages
-from stream_dmr.recording.selection import Selection
+from stream_dmr.recording.reading import Recording, decoded_messages, require_messages
+from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.batch_folder import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort, watched_times
@@ -27,35 +26,50 @@ from stream_dmr.store.open_results import LostRecording, open_results
 from stream_dmr.store.trip import VesselTrack, read_positions
 from stream_dmr.web.report_page import RunReport, render_page
 from stream_dmr.web.trip_map import Line
-from stream_dmr.web.views import draw_views, read_tracks
+from stream_dmr.web.views import DrawnFish, draw_fish, frame_images
+
+# Chosen: some 90 MB. A page of twenty thousand fish would be one of 600 MB, which no browser opens.
+MAX_DRAWN = 3000
 
 
 def open_report(
-    path: Path, *, source: str | None = None, config: Path | None = None, as_measured: bool = False
+    path: Path,
+    *,
+    source: str | None = None,
+    config: Path | None = None,
+    as_measured: bool = False,
+    max_drawn: int = MAX_DRAWN,
 ) -> RunReport:
     """Read the report of a run's folder or of a recording; `as_measured`: without any review.
 
-    Raises UserError if they can't be read, or if `source` is not the recorded source.
+    Frames and views are read of the last `max_drawn` fish. Raises UserError if something can't be
+    read, or if `source` is not the recorded source.
     """
     recording = open_results(path)
     header = recording.header
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
     database = database_of(path)
-    reviewed = ReviewedMessages(recording, None if as_measured else database)
     if database is None:
         require_messages(recording)
     if as_measured and database is not None:
         fish = read_measured_fish(database)
     else:
         fish = read_fish(path, recording)
-    is_lost = isinstance(recording, LostRecording)
-    tracks = {} if is_lost else read_tracks(reviewed)
+    undrawn = max(0, len(fish) - max_drawn)
+    last = frozenset(caught.estimate.track_id for caught in fish[undrawn:])
+    selection = Selection(tracks=last) if undrawn else EVERYTHING
+    reviewed = ReviewedMessages(recording, None if as_measured else database, selection)
+    drawn, is_lost = dict[int, DrawnFish](), isinstance(recording, LostRecording)
+    if source is not None and not is_lost:
+        _require_source(recording, source)
+    if last and not is_lost:
+        drawn = draw_fish(reviewed, recording, source)
     return RunReport(
         path=path,
         recording=recording,
         fish=fish,
-        tracks=tracks,
-        views={} if is_lost else draw_views(tracks, recording, source),
+        drawn=lambda track_id: drawn.get(track_id, DrawnFish()),
+        undrawn=0 if is_lost else undrawn,
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
         edits=reviewed.edits,
@@ -72,20 +86,11 @@ def open_report(
     )
 
 
-def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLookup) -> RunReport:
-    """The report after more edits of reviewers, with the frames and views of the `changed` fish."""
-    selection = Selection(tracks=changed)
-    reviewed = ReviewedMessages(report.recording, database_of(report.path), selection)
-    tracks = read_tracks(reviewed)
-    views = draw_views(tracks, report.recording, pictures=pictures)
-    gone = changed - tracks.keys()
-    return replace(
-        report,
-        fish=read_fish(report.path, report.recording),
-        tracks={k: v for k, v in {**report.tracks, **tracks}.items() if k not in gone},
-        views={k: v for k, v in {**report.views, **views}.items() if k not in gone},
-        edits=reviewed.edits,
-    )
+def _require_source(recording: Recording, source: str) -> None:
+    """SourceError if the first frame of `source` is not the recorded one."""
+    for first, _ in decoded_messages(recording, [Frame]):
+        next(frame_images(recording, {first.timestamp_ns}, source, is_given=True), None)
+        return
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -118,8 +123,11 @@ def open_folders(
     source: str | None = None,
     config: Path | None = None,
     as_measured: bool = False,
+    max_drawn: int = MAX_DRAWN,
 ) -> tuple[list[RunReport], list[str]]:
     """The reports of all runs of some folders and batches, and a line for each failed video.
+
+    Frames and views are read of the last `max_drawn` fish of all of them.
 
     Raises UserError, also if their templates differ, since a page has a single template.
     """
@@ -129,9 +137,13 @@ def open_folders(
             f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos have "
             "their own"
         )
-    reports = [
-        open_report(run, source=source, config=config, as_measured=as_measured) for run in runs
-    ]
+    reports = list[RunReport]()
+    for run in reversed(runs):
+        report = open_report(
+            run, source=source, config=config, as_measured=as_measured, max_drawn=max_drawn
+        )
+        max_drawn = max(0, max_drawn - len(report.fish))
+        reports.insert(0, report)
     rows = [row for batch in batches for row in read_videos(batch)]
     failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     names = {report.recording.header.template.name for report in reports}
@@ -156,6 +168,12 @@ def write_report(
     `coast` is drawn on the map.
     """
     make_folder(out.parent)
+    if undrawn := sum(report.undrawn for report in reports):
+        line = (
+            f"the first {undrawn} of {sum(len(report.fish) for report in reports)} fish are here "
+            "without their frames and pictures; `stream-dmr review` shows those of all"
+        )
+        notes = [*notes, line]
     page = render_page(reports, title=title, notes=notes, coast=coast)
     replace_text(out, page)
     add_files(out.parent, [out])

@@ -4,7 +4,7 @@ import math
 import sys
 from base64 import b64encode
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -28,12 +28,13 @@ from stream_dmr.store.fisheries import FisheriesSettings
 from stream_dmr.store.open_results import template_of_fish
 from stream_dmr.store.run_facts import RunFacts
 from stream_dmr.store.trip import VesselTrack
+from stream_dmr.store.verdicts import Ends
 from stream_dmr.tables import utc_text
 from stream_dmr.template.template_file import bundled_names
 from stream_dmr.version import __version__
 from stream_dmr.web.pages import render
 from stream_dmr.web.trip_map import Line, draw_map
-from stream_dmr.web.views import DrawnView, DrawnViews, FishFrame, RecordedTrack
+from stream_dmr.web.views import DrawnFish, DrawnView, FishFrame
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,11 +44,11 @@ class RunReport:
     path: Path
     recording: Recording
     fish: Sequence[Fish]
-    tracks: Mapping[int, RecordedTrack]  # by track id
-    views: DrawnViews
+    drawn: Callable[[int], DrawnFish]  # by track id
+    undrawn: int = 0  # fish, the first ones, whose frames and views were not read
     config: Config  # of the run
     settings: FisheriesSettings
-    edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
+    edits: TrackEdits = NO_EDITS  # of reviewers, which `fish` and `drawn` follow
     source: str | None = None  # path or address of the source, if the user gave it
     efforts: Sequence[HaulEffort] = ()  # of the hauls; empty for a recording without its database
     track: VesselTrack | None = None
@@ -172,8 +173,8 @@ def render_page(
 ) -> str:
     """The page of a report, or of all reports of a batch, which have the same template.
 
-    With `review`, readers enter verdicts, and the page sends them to its server. `review` has the
-    keys `reviewer` and `blind`, and `sample` if a sample was drawn.
+    With `review`, readers enter verdicts, and the page sends them to its server, which it asks for
+    details. `review` has the keys `reviewer` and `blind`, and `sample` if a sample was drawn.
     """
     template = reports[0].recording.header.template
     placed = place(reports)
@@ -194,11 +195,16 @@ def render_page(
         "fates": FATES,
         "conditions": CONDITIONS,
     }
-    rows = [part.row(fish) for part in placed for fish in part.report.fish]
-    details = (
-        (part.row_id(fish.estimate.track_id), fish_detail(fish, part.report))
+    rows = [
+        part.row(fish) | ({} if review else {"thumbnail": _thumbnail(fish, part.report)})
         for part in placed
         for fish in part.report.fish
+    ]
+    details = (
+        (part.row_id(fish.estimate.track_id), detail)
+        for part in (() if review else placed)
+        for fish in part.report.fish
+        if (detail := fish_detail(fish, part.report))["frames"]
     )
     return render(
         "report/page.html",
@@ -264,12 +270,11 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
-    """The row of a fish in the table: its row of fish.csv, and a thumbnail of its best view."""
+    """The row of a fish in the table: its row of fish.csv, and what the page shows besides."""
     template = template_of_fish(report.recording, fish)
     record = fish_record(fish, template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
-    views = report.views.get(fish.estimate.track_id, [])
     return row | {
         "id": fish.estimate.track_id,  # in the page
         "run": 0,
@@ -281,34 +286,21 @@ def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
         "time_s": fish.estimate.first_timestamp_ns / 1e9,
         "refused": dict(fish.estimate.refused),
         "flags": list(fish.flags),
-        "thumbnail": _uri(views[0].thumbnail) if views else "",
-        "moved": _moved_points(fish, views),
     }
 
 
-def _moved_points(fish: Fish, views: Sequence[DrawnView]) -> dict[int, Any]:
-    """Head and tail points that a reviewer set, by frame index, in pixels of the crop."""
-    by_frame = {view.recorded.row.fish.frame_index: view for view in views}
-    return {
-        frame_index: np.round(
-            crop_from_frame(
-                np.array(points), crop_camera=view.crop_camera, frame_camera=view.frame_camera
-            ),
-            2,
-        ).tolist()
-        for frame_index, points in fish.review.moved.items()
-        if (view := by_frame.get(frame_index)) is not None
-    }
+def _thumbnail(fish: Fish, report: RunReport) -> str:
+    views = report.drawn(fish.estimate.track_id).views
+    return _uri(views[0].thumbnail) if views else ""
 
 
 def fish_detail(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The details that a row opens: best views, every frame, the mesh."""
-    views = report.views.get(fish.estimate.track_id, [])
-    track = report.tracks.get(fish.estimate.track_id)
+    drawn = report.drawn(fish.estimate.track_id)
     return {
-        "frames": [_frame_values(row) for row in track.rows] if track else [],
-        "views": [_view_values(view) for view in views],
-        "mesh": _mesh_values(views[0]) if views else None,
+        "frames": [_frame_values(row) for row in drawn.rows],
+        "views": [_view_values(view, fish.review.moved) for view in drawn.views],
+        "mesh": _mesh_values(drawn.views[0]) if drawn.views else None,
     }
 
 
@@ -329,15 +321,21 @@ def _frame_values(row: FishFrame) -> list[Any]:
     ]
 
 
-def _view_values(view: DrawnView) -> dict[str, Any]:
-    fish = view.recorded.row.fish
+def _view_values(view: DrawnView, moved: Mapping[int, Ends]) -> dict[str, Any]:
+    frame_index = view.recorded.row.fish.frame_index
+    keypoints = view.outlines.keypoints
+    if frame_index in moved:  # by a reviewer
+        cameras = {"crop_camera": view.crop_camera, "frame_camera": view.frame_camera}
+        head, tail = crop_from_frame(np.array(moved[frame_index]), **cameras)
+        keypoints = np.stack([head, keypoints[1], tail])
     return {
-        "frame": fish.frame_index,
+        "frame": frame_index,
         "size": view.crop_camera.width,
         "uri": _uri(view.picture),
         "mask": [_points(line) for line in view.outlines.mask],
         "mesh": [_points(line) for line in view.outlines.mesh],
-        "keypoints": np.round(view.outlines.keypoints, 2).tolist(),
+        "keypoints": np.round(keypoints, 2).tolist(),
+        "moved": frame_index in moved,
     }
 
 

@@ -93,6 +93,12 @@ class ReviewQueue:
             return fish_detail(fish, self._recorder(run).report)
         raise UserError(f"expected a fish of this review, got {track_id}")
 
+    def thumbnail(self, run: int, track_id: int) -> bytes:
+        """The best view of a fish as WebP; empty if there is none."""
+        return next(
+            (view.thumbnail for view in self._recorder(run).report.drawn(track_id).views), b""
+        )
+
     def clip(self, run: int, track_id: int, shift: int) -> Iterator[bytes]:
         """The clip around a fish, see `fish_clip`. UserError without such a fish."""
         recorder = self._recorder(run)
@@ -197,6 +203,9 @@ class ReviewServer(TokenServer):
             ("GET", "/reviewed.json"): lambda _: json_response(queue.reviewed_rows()),
             ("GET", "/fish.json"): lambda asked: json_response(
                 queue.detail(asked.number("run"), asked.number("fish"))
+            ),
+            ("GET", "/thumbnail"): lambda asked: Response(
+                queue.thumbnail(asked.number("run"), asked.number("fish")), "image/webp"
             ),
             ("GET", "/clip"): lambda asked: Response(
                 queue.clip(asked.number("run"), asked.number("fish"), asked.number("shift")),

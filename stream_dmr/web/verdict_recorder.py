@@ -1,7 +1,8 @@
 """Check the submissions of a reviewer and write verdicts, edits and corrected lengths."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 
@@ -15,8 +16,15 @@ from stream_dmr.evidence.seal import seal_verdicts
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
-from stream_dmr.store.edits import changed_fish, corrected_fish, corrected_length, edits_of
-from stream_dmr.store.fish import database_of
+from stream_dmr.recording.selection import Selection
+from stream_dmr.store.edits import (
+    ReviewedMessages,
+    changed_fish,
+    corrected_fish,
+    corrected_length,
+    edits_of,
+)
+from stream_dmr.store.fish import database_of, read_fish
 from stream_dmr.store.verdicts import (
     BLIND,
     EDITS,
@@ -35,12 +43,12 @@ from stream_dmr.store.verdicts import (
     standing,
 )
 from stream_dmr.web.added_fish import TrackEditor, require_equal_lengths
-from stream_dmr.web.open_reports import reread_fish
 from stream_dmr.web.report_page import RunReport
-from stream_dmr.web.views import RecordedView, recorded_source
+from stream_dmr.web.views import DrawnFish, RecordedView, draw_fish, recorded_source
 
 Point = tuple[float, float]  # x, y
 _DIGITS = r"^\d{1,19}$"
+_KEPT = 100  # fish, with their pictures
 
 
 class DrawnBox(BaseModel):
@@ -122,12 +130,12 @@ class VerdictRecorder:
         With `blind`, the reader sees the fish as they were measured, and changes no review.
         """
         self._database = require_database(report)
-        self.report = report
         self._reviewer = reviewer
         self._reading = BLIND if blind else None
         self.pictures = FrameLookup(
             report.recording, report.source or recorded_source(report.recording)
         )
+        self.report = replace(report, drawn=self._drawn_on_demand(report))
         self._editor = TrackEditor(self._database, self.pictures)
         self._lock = Lock()
         self._known: list[Verdict] = []
@@ -185,9 +193,27 @@ class VerdictRecorder:
         """Update the report by the edits of all reviewers; a blind reading applies none."""
         if self._reading is not None:
             return
-        changed = changed_fish(self.report.edits, edits_of(verdicts))
-        if changed:
-            self.report = reread_fish(self.report, frozenset(changed), self.pictures)
+        edits = edits_of(verdicts)
+        if changed_fish(self.report.edits, edits):
+            self.report = replace(
+                self.report,
+                fish=read_fish(self.report.path, self.report.recording),
+                drawn=self._drawn_on_demand(self.report),
+                edits=edits,
+            )
+
+    def _drawn_on_demand(self, report: RunReport) -> Callable[[int], DrawnFish]:
+        """Reads and draws a fish when it is asked for: a review of weeks begins at once."""
+        database = self._database if self._reading is None else None
+
+        @lru_cache(_KEPT)
+        def drawn(track_id: int) -> DrawnFish:
+            selection = Selection(tracks=frozenset([track_id]))
+            reviewed = ReviewedMessages(report.recording, database, selection)
+            found = draw_fish(reviewed, report.recording, pictures=self.pictures)
+            return found.get(track_id, DrawnFish())
+
+        return drawn
 
     def _verdict(self, submitted: SubmittedVerdict) -> Verdict:
         kind = submitted.kind
@@ -305,8 +331,7 @@ class VerdictRecorder:
         return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
     def _view(self, track_id: int, frame_index: int) -> RecordedView:
-        track = self.report.tracks.get(track_id)
-        for view in track.views if track else ():
-            if view.row.fish.frame_index == frame_index:
-                return view
+        for view in self.report.drawn(track_id).views:
+            if view.recorded.row.fish.frame_index == frame_index:
+                return view.recorded
         raise UserError(f"verdict: fish {track_id} is not shown in frame {frame_index}")

@@ -224,6 +224,30 @@ class DrawnView:
 DrawnViews = Mapping[int, list[DrawnView]]  # track id -> its best views, the best first
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnFish:
+    """All frames of a fish, and its best views; empty where nothing of it was read."""
+
+    rows: Sequence[FishFrame] = ()
+    views: Sequence[DrawnView] = ()  # the best first
+
+
+def draw_fish(
+    reviewed: ReviewedMessages,
+    recording: Recording,
+    source: str | None = None,
+    *,
+    pictures: FrameLookup | None = None,
+) -> dict[int, DrawnFish]:
+    """The fish of a recording by track id; `source` and `pictures` as in `draw_views`."""
+    tracks = read_tracks(reviewed)
+    views = draw_views(tracks, recording, source, pictures=pictures)
+    return {
+        track_id: DrawnFish(rows=track.rows, views=views.get(track_id, ()))
+        for track_id, track in tracks.items()
+    }
+
+
 def draw_views(
     tracks: Mapping[int, RecordedTrack],
     recording: Recording,

@@ -128,7 +128,7 @@ def test_equal_seeds_draw_equal_fish(out: Path):
     assert len(drawn) == 2
     assert drawn < everything == sampled(numbers, AuditSample(size=99))
     for page in (text, again.page("x")):
-        assert {number for number in everything if f'id="fish-{number}"' in page} == drawn
+        assert {number for number in everything if f'"id":{number},' in page} == drawn
     assert run_folders([out]) == [out]
 
 

@@ -82,9 +82,10 @@ def test_each_fish_is_shown_and_exported_by_its_own_inputs(changed: Path, tmp_pa
     by_fish = lengths(changed)
     assert by_fish[3] == pytest.approx(2 * by_fish[1], rel=0.1)
     report = open_report(changed)
-    assert {caught.estimate.track_id for caught in report.fish} == set(report.views) == {1, 2, 3, 4}
+    assert [caught.estimate.track_id for caught in report.fish] == [1, 2, 3, 4]
+    assert all(report.drawn(fish).views for fish in (1, 2, 3, 4))
     first, second = (
-        cv2.imdecode(np.frombuffer(report.views[fish][0].picture, np.uint8), 1).mean()
+        cv2.imdecode(np.frombuffer(report.drawn(fish).views[0].picture, np.uint8), 1).mean()
         for fish in (1, 3)
     )
     assert second < 0.5 * first
@@ -103,7 +104,7 @@ def test_each_fish_is_shown_and_exported_by_its_own_inputs(changed: Path, tmp_pa
 def test_a_reviewer_works_by_the_inputs_of_the_fish(changed: Path, fish: int):
     report = open_report(changed)
     queue = ReviewQueue([report], reviewer="Ada")
-    view = report.tracks[fish].views[0]
+    view = report.drawn(fish).views[0].recorded
     crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
     assert fit.shape is not None
     ends = crop_from_frame(
@@ -130,7 +131,7 @@ def test_a_reviewer_works_by_the_inputs_of_the_fish(changed: Path, fish: int):
 def test_a_fish_is_not_added_across_two_configs(changed: Path):
     report = open_report(changed)
     box = {"x0": 8.0, "y0": 18.0, "x1": 52.0, "y1": 104.0}
-    ends = report.tracks[1].rows[-2].fish, report.tracks[3].rows[-1].fish
+    ends = report.drawn(1).rows[-2].fish, report.drawn(3).rows[-1].fish
     drawn = [
         box | {"frame_index": f.frame_index, "timestamp_ns": str(f.timestamp_ns)} for f in ends
     ]
@@ -146,7 +147,7 @@ def test_verify_asks_no_length_of_an_added_fish_whose_settings_were_deleted(
     out = Path(shutil.copytree(changed, tmp_path / "out"))
     report = open_report(out)
     box = {"x0": 8.0, "y0": 18.0, "x1": 52.0, "y1": 104.0}
-    seen = {row.fish.frame_index: row.fish.timestamp_ns for row in report.tracks[1].rows}
+    seen = {row.fish.frame_index: row.fish.timestamp_ns for row in report.drawn(1).rows}
     drawn = [box | {"frame_index": index, "timestamp_ns": str(seen[index])} for index in (1, 5)]
     said = {"kind": "add", "boxes": drawn, "sure": True}
     (row,) = ReviewQueue([report], reviewer="Ada").record(json.dumps(said).encode())["rows"]

@@ -57,7 +57,7 @@ def test_a_clip_has_every_frame_with_its_fish(report: RunReport):
 
 def test_outlines_are_those_of_the_masks(report: RunReport):
     frames = {frame["frame"]: frame for frame, _ in read(report, None)}
-    view = report.tracks[1].views[0]
+    view = report.drawn(1).views[0].recorded
     crop = decode(FishCrop, view.crop)
     (line,) = next(o["mask"] for o in frames[crop.frame_index]["fish"] if o["fish"] == 1)
     rows, columns = np.nonzero(crop.mask)

@@ -52,7 +52,11 @@ def test_a_reviewer_types_fate_condition_and_species(
 ):
     tab = Tab(server.address)
     try:
-        tab.run("choose(1); await new Promise((done) => setTimeout(done, 300))")
+        tab.run(
+            "choose(1);"
+            "while (!(chosenFish()?.detail && document.getElementById('fate-name')))"
+            " await new Promise((done) => setTimeout(done, 20))"
+        )
         type_after(tab, "f", "dropped")
         type_after(tab, "c", "a2")
         type_after(tab, "s", "swordfish")

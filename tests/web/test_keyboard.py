@@ -28,7 +28,7 @@ FIRST_OPEN = WAIT + "choose(1); await until(() => player.clip?.isDone && player.
 @pytest.fixture
 def server(out: Path, tmp_path: Path) -> Iterator[ReviewServer]:
     other = Path(shutil.copytree(out, tmp_path / "other"))  # several folders are one review
-    reports, _ = open_folders([out, other])
+    reports, _ = open_folders([out, other], max_drawn=0)
     served = ReviewServer(ReviewQueue(reports, reviewer="Ada"), title="two")
     yield served
     served.close()

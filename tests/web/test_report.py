@@ -17,6 +17,7 @@ from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.web import open_reports
 from stream_dmr.web.open_reports import open_report, write_report
+from stream_dmr.web.review_queue import ReviewQueue
 from stream_dmr.web.views import draw_views, read_tracks
 from tests.support.browser import Tab, evaluate
 from tests.support.command import invoke, rows
@@ -93,6 +94,8 @@ def test_pictures_come_from_the_clip_and_without_it_from_the_mask(out: Path, tmp
     writer.release()
     with pytest.raises(SourceError, match="not the recorded one"):
         draw_views(tracks, recording, str(other))
+    with pytest.raises(SourceError, match="not the recorded one"):
+        open_report(out, source=str(other), max_drawn=0)  # of a review
     shutil.move(clip, tmp_path / "moved.mp4")
     try:
         masked = draw_views(tracks, recording)[1][0].picture
@@ -308,3 +311,35 @@ def test_a_full_disk_leaves_the_report_that_was_there(
     with file_size_limit(100), pytest.raises(OutputError, match="too large"):
         open_reports.write_report([], page, title="")
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(page.name, "before")]
+
+
+def test_a_large_report_has_the_pictures_of_its_last_fish(out: Path, tmp_path: Path):
+    other = Path(shutil.copytree(out, tmp_path / "other"))
+    reports, _ = open_reports.open_folders([out, other], max_drawn=3)
+    drawn = [[bool(report.drawn(k).views) for k in (1, 2)] for report in reports]
+    assert drawn == [[False, True], [True, True]]
+    page = tmp_path / "report.html"
+    write_report(reports, page, title="two")
+    assert "the first 1 of 4 fish are here without their frames and pictures" in page.read_text()
+    shown = evaluate(
+        page,
+        """
+        const seen = [];
+        for (const fish of DATA.fish.slice(0, 2)) {
+          state.chosen = fish.id;
+          await drawDetail(fish);
+          seen.push(document.querySelectorAll('.views svg').length);
+        }
+        return [DATA.fish.length, ...seen];
+        """,
+    )
+    assert shown == [4, 0, 3]
+
+
+def test_a_review_reads_no_fish_before_it_is_opened(out: Path, monkeypatch: pytest.MonkeyPatch):
+    queue = ReviewQueue([open_report(out, max_drawn=0)], reviewer="Ada")
+    with monkeypatch.context() as patched:
+        patched.delattr(ReviewedMessages, "decoded")
+        assert "Choose a fish" in queue.page("x")
+    assert len(queue.detail(0, 1)["views"]) == 3
+    assert queue.thumbnail(0, 1)

@@ -44,7 +44,7 @@ def submit(judge: ReviewQueue, **said: Any) -> dict[str, Any]:
 
 def ends(report: RunReport, track_id: int) -> tuple[int, FittedMesh, list[list[float]]]:
     """The best frame of a fish, its fit, and its head and tail in pixels of the crop."""
-    view = report.tracks[track_id].views[0]
+    view = report.drawn(track_id).views[0].recorded
     crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
     assert fit.shape is not None
     pixels = crop_from_frame(
@@ -58,7 +58,7 @@ def test_points_left_where_they_are_give_the_length_of_their_frame(
 ):
     frame_index, fit, (head, tail) = ends(report, 1)
     row = submit(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=tail)
-    of_frame = report.tracks[1].views[0].row.fish
+    of_frame = report.drawn(1).views[0].recorded.row.fish
     assert fit.shape is not None
     assert row["corrected_length_mm"] == pytest.approx(of_frame.length_mm, rel=1e-6)
     assert row["length_from"] == "review"
@@ -71,7 +71,7 @@ def test_a_tail_further_out_is_a_longer_fish(judge: ReviewQueue, report: RunRepo
     row = submit(
         judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further
     )
-    of_frame = report.tracks[1].views[0].row.fish.length_mm
+    of_frame = report.drawn(1).views[0].recorded.row.fish.length_mm
     assert of_frame is not None
     assert row["corrected_length_mm"] == pytest.approx(1.1 * of_frame, rel=0.03)
     assert row["length_mm"] == pytest.approx(float(before[0]["length_mm"]), abs=1e-6)
@@ -82,8 +82,9 @@ def test_a_tail_further_out_is_a_longer_fish(judge: ReviewQueue, report: RunRepo
 def test_two_corrected_frames_are_put_together_as_a_run_does(judge: ReviewQueue, report: RunReport):
     frames = {}
     row: dict[str, Any] = {}
-    for view in report.tracks[1].views[:2]:
-        crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
+    for view in report.drawn(1).views[:2]:
+        crop = decode(FishCrop, view.recorded.crop)
+        fit = decode(FittedMesh, view.recorded.fit)
         assert fit.shape is not None
         points = fit.shape.keypoints_px[[0, 2]]
         head, tail = crop_from_frame(
@@ -341,17 +342,15 @@ def test_a_corrected_length_has_its_own_interval(tab: Tab, judge: ReviewQueue, r
 def test_moved_points_are_in_the_report(judge: ReviewQueue, report: RunReport, out: Path):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
-    row = submit(
-        judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further
-    )
-    assert row["moved"][frame_index] == [
-        pytest.approx(head, abs=0.01),
-        pytest.approx(further, abs=0.01),
-    ]
+    submit(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    view = judge.detail(0, 1)["views"][0]
+    assert view["moved"]
+    shown = [view["keypoints"][0], view["keypoints"][2]]
+    assert shown == [pytest.approx(head, abs=0.01), pytest.approx(further, abs=0.01)]
     text = render_page([open_report(out)], title="out")
-    moved = json.dumps(row["moved"], separators=(",", ":"))
-    assert f'"moved":{moved}' in text
-    assert submit(judge, track_id=1, kind="withdraw")["moved"] == {}
+    assert f'"keypoints":{json.dumps(view["keypoints"], separators=(",", ":"))}' in text
+    submit(judge, track_id=1, kind="withdraw")
+    assert not judge.detail(0, 1)["views"][0]["moved"]
 
 
 def test_a_key_that_is_held_judges_one_fish(tab: Tab, out: Path):

@@ -93,7 +93,9 @@ function clipCame() {
   for (const one of player.clip.frames) growBox(one);
   drawClip();
   const next = nextUnreviewed(player.fish.id);
-  if (next) loadClip(next, 0);
+  if (!next) return;
+  loadClip(next, 0);
+  if (!next.detail) detailOfServer(next).then((detail) => { next.detail = detail; });
 }
 
 function growBox(frame) {

@@ -4,6 +4,7 @@ const SVG = "http://www.w3.org/2000/svg";
 // One plot of each kind for all fish, since a new one takes longer than new data in an old one.
 const FRAMES_PLOT = element("div", { className: "plot" });
 const MESH_PLOT = element("div", { className: "mesh-plot" });
+const NO_DETAIL = '{"frames": [], "views": [], "mesh": null}';
 const POINTS = [["head", "#ff3c3c"], ["center", "#ffffff"], ["tail", "#3ca0ff"]];
 
 function svg(tag, attributes, ...children) {
@@ -15,16 +16,13 @@ function svg(tag, attributes, ...children) {
 
 function viewFigure(view, fish) {
   const s = view.size;
-  const moved = fish.moved[view.frame];
-  const [, center] = view.keypoints;
-  const keypoints = moved ? [moved[0], center, moved[1]] : view.keypoints;
   const box = svg("svg", { viewBox: `-0.5 -0.5 ${s} ${s}`, "data-frame": view.frame },
     svg("image", { href: view.uri, x: -0.5, y: -0.5, width: s, height: s, preserveAspectRatio: "none" }),
     ...view.mask.map((points) => svg("polygon", { points, class: "mask" })),
     ...view.mesh.map((points) => svg("polygon", { points, class: "mesh" })),
-    ...POINTS.map(([name, fill], k) => svg("circle", { cx: keypoints[k][0], cy: keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
+    ...POINTS.map(([name, fill], k) => svg("circle", { cx: view.keypoints[k][0], cy: view.keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
   const row = fish.detail.frames.find((frame) => frame[0] === view.frame);
-  const caption = row ? `frame ${view.frame}, ${row[2] === null ? "" : `${cm(row[2])} cm, `}IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${view.frame}`;
+  const caption = row ? `frame ${view.frame}, ${row[2] === null ? "" : `${cm(row[2])} cm, `}IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${view.moved ? ", points moved" : ""}` : `frame ${view.frame}`;
   const figure = element("figure", {}, box, element("figcaption", {}, element("small", { textContent: caption }),
     element("button", { type: "button", textContent: "larger", onclick: () => figure.classList.toggle("large") })));
   return figure;
@@ -69,7 +67,7 @@ function placeOf(fish) {
 
 async function drawDetail(fish) {
   const panel = document.getElementById("detail");
-  fish.detail ??= fish.isLate ? await detailOfServer(fish) : JSON.parse(document.getElementById(`fish-${fish.id}`).textContent);
+  fish.detail ??= isReview() ? await detailOfServer(fish) : JSON.parse(document.getElementById(`fish-${fish.id}`)?.textContent ?? NO_DETAIL);
   if (state.chosen !== fish.id) return;
   const views = element("div", { className: "views" }, ...fish.detail.views.map((view) => viewFigure(view, fish)));
   const overlay = element("input", { type: "checkbox", checked: true, onchange: () => views.classList.toggle("plain", !overlay.checked) });

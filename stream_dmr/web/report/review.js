@@ -2,9 +2,21 @@
 
 const DECISIONS = ["accept", "reject", "duplicate", "merge"];  // after which the next fish is shown
 
-// The frames, views and mesh of a fish that changed since the page was made.
+// The frames, views and mesh of a fish.
 async function detailOfServer(fish) {
   return fetch(`fish.json?run=${fish.run}&fish=${fish.track_id}`).then((answer) => answer.json());
+}
+
+// An image that is loaded after the others before it: drawn all at once they would hold up the clip.
+let lastThumbnail = Promise.resolve();
+function thumbnailOfServer(fish) {
+  const image = element("img", { alt: "" });
+  lastThumbnail = lastThumbnail.then(() => new Promise((done) => {
+    if (!image.isConnected) { fish.image = null; return done(); }  // scrolled past
+    image.onload = image.onerror = done;
+    image.src = `thumbnail?run=${fish.run}&fish=${fish.track_id}`;
+  }));
+  return image;
 }
 
 // What a reviewer sees of a fish before everything else. What was said last stays in sight.
@@ -97,9 +109,9 @@ async function send(verdict) {
 function takeRows(rows) {
   for (const row of rows) {
     const at = DATA.fish.findIndex((one) => one.id === row.id), old = DATA.fish[at];
-    const isSame = old && ["origin", "frames_seen", "first_frame", "last_frame"].every((name) => old[name] === row[name]);
+    const isSame = old && ["origin", "frames_seen", "first_frame", "last_frame", "corrected_length_mm"].every((name) => old[name] === row[name]);
     if (row.gone) { if (at >= 0) DATA.fish.splice(at, 1); continue; }
-    Object.assign(row, isSame ? { detail: old.detail, isLate: old.isLate } : { isLate: true });
+    if (isSame) Object.assign(row, { detail: old.detail, image: old.image });
     if (at >= 0) DATA.fish[at] = row;
     else DATA.fish.push(row);
   }

@@ -112,11 +112,12 @@ function rowOf(fish) {
   const said = [because, species, fish.fate ?? ""].filter(Boolean).map((textContent) => element("small", { textContent }));
   const verdict = element("span", { textContent: VERDICTS[fish.verdict] ?? "", title: [because, species, fish.fate].filter(Boolean).join(", ") }, ...said);
   if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
+  fish.image ??= isReview() ? thumbnailOfServer(fish) : fish.thumbnail ? element("img", { src: fish.thumbnail, alt: "", loading: "lazy" }) : element("span");
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
     "div",
     { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
-    fish.thumbnail ? element("img", { src: fish.thumbnail, alt: "", loading: "lazy" }) : element("span"),
+    fish.image,
     element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video, title: fish.video }), element("small", { textContent: fish.haul && `haul ${fish.haul}` })),
     element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
