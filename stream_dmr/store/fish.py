@@ -31,6 +31,7 @@ from stream_dmr.store.schema import (
 )
 from stream_dmr.store.trip import (
     NOWHERE,
+    Haul,
     VesselTrack,
     Whereabouts,
     haul_at,
@@ -175,17 +176,26 @@ def read_stored_fish(database: Path) -> list[Fish]:
     return _stored_fish(database, read_verdicts(database))
 
 
-def read_measured_fish(database: Path) -> list[Fish]:
-    """All fish of a lengths.db as they were measured, without any review. OutputError likewise."""
-    return _stored_fish(database, ())
+def read_measured_fish(database: Path, *, span: Haul | None = None) -> list[Fish]:
+    """All fish of a lengths.db as they were measured, without any review. OutputError likewise.
+
+    `span`: only those whose track ended in it.
+    """
+    return _stored_fish(database, (), span=span)
 
 
-def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
+def _stored_fish(
+    database: Path, verdicts: Sequence[Verdict], *, span: Haul | None = None
+) -> list[Fish]:
     reviews, edits = reviews_of(verdicts), edits_of(verdicts).fish
     try:
         with reading(database) as connection:
             runs = {row["run_id"]: _run_of(row) for row in rows(connection, RUNS)}
-            stored = list(rows(connection, FISH))
+            stored = [
+                row
+                for row in rows(connection, FISH)
+                if span is None or span.includes(row["last_timestamp_ns"])
+            ]
             hauls = hauls_of(rows(connection, HAULS))
             vessel = VesselTrack(positions_of(connection))
         if unknown := {row["run_id"] for row in stored} - runs.keys():

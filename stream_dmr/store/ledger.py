@@ -81,9 +81,7 @@ class Signer:
 
     def continue_chain(self, database: sqlite3.Connection) -> None:
         if self._key is not None:
-            (number,) = database.execute("SELECT MAX(number) FROM chain").fetchone()
-            last = records(database, LEDGER, ChainEntry, after=(number or 0) - 1)
-            self._last = last[0] if last else None
+            self._last = last_entry(database)
 
     def row(self, kind: str, name: str, values: Mapping[str, object]) -> list[Statement]:
         return self.content(kind, name, content_sha256(values)) if self._key else []
@@ -193,6 +191,13 @@ def _canonical(values: Mapping[str, object]) -> bytes:
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
     """All entries in their order; none if nothing was signed."""
     return records(database, LEDGER, ChainEntry)
+
+
+def last_entry(database: sqlite3.Connection) -> ChainEntry | None:
+    """The last entry alone; None if nothing was signed."""
+    (number,) = database.execute("SELECT MAX(number) FROM chain").fetchone()
+    last = records(database, LEDGER, ChainEntry, after=(number or 0) - 1)
+    return last[0] if last else None
 
 
 def is_entry(row: Mapping[str, Any]) -> bool:

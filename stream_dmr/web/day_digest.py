@@ -3,7 +3,7 @@
 import shutil
 import threading
 import time
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -26,7 +26,7 @@ from stream_dmr.recording.selection import Selection
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import Fish, read_measured_fish, read_runs
-from stream_dmr.store.ledger import Signer, read_chain
+from stream_dmr.store.ledger import Signer, last_entry
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import last_checks
 from stream_dmr.store.schema import (
@@ -80,8 +80,7 @@ def write_digest(
         raise OutputError(f"{folder}: expected a day (UTC) of its runs, {known}, got {day}")
     began_ns = (day - _EPOCH).days * _DAY_NS - zero_ns
     span = Haul(name="", began_ns=began_ns, ended_ns=began_ns + _DAY_NS)
-    fish = read_measured_fish(folder / DATABASE)
-    fish = [caught for caught in fish if span.includes(caught.estimate.last_timestamp_ns)]
+    fish = read_measured_fish(folder / DATABASE, span=span)
     content = _content(folder / DATABASE, span, fish, zero_ns, problems)
     content["box"]["num_fish"] = days.total()
     recordings = _recordings(folder, span)
@@ -133,7 +132,7 @@ def _content(
     flags = Counter(flag[:_MAX_TEXT] for caught in fish for flag in caught.flags)
     warnings = [f"{count} fish: {flag}" for flag, count in flags.most_common(_MAX_WARNINGS)]
     with reading(database) as connection:
-        chain = [[last.number, last.sha256] for last in read_chain(connection)[-1:]]
+        last = last_entry(connection)
     return {
         **{"day": str(_day_of(span.began_ns + zero_ns)), "made_ns": time.time_ns()},
         **{"vessel": facts.vessel, "trip": facts.trip, "software_version": __version__},
@@ -144,7 +143,7 @@ def _content(
             "fish_per_hour": len(fish) / hours if hours else 0.0,
             "disk_free_bytes": shutil.disk_usage(database.parent).free,
         },
-        "chain": chain,  # number and SHA-256 of its last entry
+        "chain": [[last.number, last.sha256]] if last else [],
         "hours_watched": round(hours, 4),
         "hauls": [
             haul_row(e, utc_zero_ns=zero_ns) for e in efforts if e.hours_watched or e.num_fish
@@ -178,14 +177,24 @@ def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
     files, found = list[Path](), list[tuple[int, Path]]()
     with suppress(RecordingError):
         files = [path for path in files_of(folder) if path.suffix in (".mcap", ".rrd")]
-    for path in reversed(files):
-        with suppress(RecordingError):
-            first = next(messages_of(open_recordings([path]), Frame), None)
-            if first is not None and span.includes(first.timestamp_ns):
-                found.append((first.timestamp_ns, path))
-            elif first is not None and first.timestamp_ns < span.began_ns:
-                break  # months of segments lie before it
+    # Months of segments may lie after the day. One that can't be read counts as before its end, so
+    # that none of the day is left out.
+    num_begun = bisect_left(files, span.ended_ns or 0, key=lambda path: _first_ns(path) or 0)
+    for path in reversed(files[:num_begun]):
+        first_ns = _first_ns(path)
+        if first_ns is not None and span.includes(first_ns):
+            found.append((first_ns, path))
+        elif first_ns is not None and first_ns < span.began_ns:
+            break  # and months before it
     return found[::-1]
+
+
+def _first_ns(recording: Path) -> int | None:
+    """The capture time of the first frame; None without one, or if it can't be read."""
+    with suppress(RecordingError):
+        first = next(messages_of(open_recordings([recording]), Frame), None)
+        return None if first is None else first.timestamp_ns
+    return None
 
 
 def grouped_sums(paths: Sequence[Path], *, most: int = _MAX_RECORDINGS) -> list[list[str]]:

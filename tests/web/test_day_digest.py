@@ -15,6 +15,7 @@ from datetime import UTC, date, datetime, timedelta
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,19 +24,31 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.errors import ConfigError, OutputError, RecordingError, UserError
 from stream_dmr.evidence.digest_file import CONTENT, pack, read_digest
 from stream_dmr.evidence.own_files import is_made_by
 from stream_dmr.evidence.verify_signatures import check_signatures
+from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.sources.sensors_settings import utc_ns_of
+from stream_dmr.store import fish as fish_module
+from stream_dmr.store import ledger
 from stream_dmr.store.ledger import Signer, load_public_key, make_key
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import EVENTS, HAULS, POSITIONS, WATCHED, read_rows
+from stream_dmr.store.schema import (
+    EVENTS,
+    HAULS,
+    POSITIONS,
+    WATCHED,
+    estimate_of,
+    read_rows,
+    records,
+)
 from stream_dmr.store.trip import (
     END,
     START,
+    Haul,
     KeptPosition,
     haul_values,
     position_values,
@@ -286,6 +299,57 @@ def test_pictures_are_small_and_of_the_fish(tmp_path: Path):
     assert image is not None
     assert image.shape == (64, 64, 3)
     assert image.std() > 5
+
+
+def test_a_day_weeks_ago_is_found_without_reading_the_weeks_since(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    began_ns, damaged, opened = noon(DAY) - DAY_NS // 2, {700, 1000}, list[int]()
+    for number in range(1, 1001):  # one an hour
+        (tmp_path / f"recording-{number:06d}.mcap").touch()
+
+    def opening(paths: list[Path]) -> int:
+        opened.append(int(paths[0].stem[-6:]))
+        if opened[-1] in damaged:
+            raise RecordingError("damaged")
+        return opened[-1]
+
+    def frames(number: int, _: object) -> Iterator[SimpleNamespace]:
+        return iter([SimpleNamespace(timestamp_ns=began_ns + (number - 500) * DAY_NS // 24)])
+
+    monkeypatch.setattr(day_digest, "open_recordings", opening)
+    monkeypatch.setattr(day_digest, "messages_of", frames)
+    span = Haul(name="", began_ns=began_ns, ended_ns=began_ns + DAY_NS)
+    for broken in (set[int](), {*range(515, 524)}, {500, 750}):
+        damaged |= broken
+        opened.clear()
+        found = [path.stem[-6:] for _, path in day_digest._recordings(tmp_path, span)]
+        assert found == [f"{n:06d}" for n in range(500, 524) if n not in damaged]
+        assert len(opened) < 40
+
+
+def test_a_digest_takes_the_fish_of_its_day_and_the_last_entry_alone(
+    key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    with closing(LengthStore(tmp_path, BOX, signer=Signer(key))) as store:
+        live(store, DAY - timedelta(days=1), range(1, 31))
+        live(store, DAY, range(31, 33))
+    made, entries = list[int](), list[ledger.ChainEntry]()
+
+    def estimate(row: dict[str, Any]) -> LengthEstimate:
+        made.append(row["track_id"])
+        return estimate_of(row)
+
+    def read(*args: Any, **options: Any) -> list[ledger.ChainEntry]:
+        entries.extend(records(*args, **options))
+        return entries
+
+    monkeypatch.setattr(fish_module, "estimate_of", estimate)
+    monkeypatch.setattr(ledger, "records", read)
+    write_digest(tmp_path, DAY, tmp_path / "d.zip", Signer(None))
+    content = content_of(tmp_path / "d.zip")
+    assert made == [row[0] for row in content["fish"][1:]] == [31, 32]
+    assert [[entry.number, entry.sha256] for entry in entries] == content["chain"]
 
 
 def test_many_recordings_are_hashed_in_groups(tmp_path: Path):
