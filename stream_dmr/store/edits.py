@@ -9,6 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from heapq import merge
 from pathlib import Path
 from statistics import median
@@ -100,10 +101,19 @@ class TrackEdits:
 
     def fish_of(self, track_id: int, frame_index: int) -> int:
         """The fish that a frame of a recorded or added track belongs to."""
-        for fish, edited in self.fish.items():
-            if any(part.has(track_id, frame_index) for part in edited.parts):
+        for fish, part in self._parts_of_track.get(track_id, ()):
+            if part.has(track_id, frame_index):
                 return fish
         return track_id
+
+    @cached_property
+    def _parts_of_track(self) -> Mapping[int, Sequence[tuple[int, TrackPart]]]:
+        """Each part of a recorded or added track, and its fish: asked for every message."""
+        parts = defaultdict[int, list[tuple[int, TrackPart]]](list)
+        for fish, edited in self.fish.items():
+            for part in edited.parts:
+                parts[part.track_id].append((fish, part))
+        return parts
 
     def after(self, verdict: Verdict) -> "TrackEdits":
         rows = {row["track_id"]: row for row in json.loads(verdict.fish or "[]")}

@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -51,6 +52,19 @@ def owners(edits: TrackEdits, track_id: int, frame_index: int) -> list[int]:
         for fish, edited in edits.fish.items()
         if any(part.has(track_id, frame_index) for part in edited.parts)
     ]
+
+
+def test_the_fish_of_a_frame_is_looked_up_by_its_track(monkeypatch: pytest.MonkeyPatch):
+    edits = edits_of([edit("split", n, frame_index=5, other_fish=1000 + n) for n in range(1, 301)])
+    asked, has = list[int](), TrackPart.has
+
+    def asking(part: TrackPart, track_id: int, frame_index: int) -> bool:
+        asked.append(part.track_id)
+        return has(part, track_id, frame_index)
+
+    monkeypatch.setattr(TrackPart, "has", asking)
+    assert [edits.fish_of(track_id, 5) for track_id in (1, 300, 301)] == [1001, 1300, 301]
+    assert len(asked) <= 4
 
 
 @given(operations)
