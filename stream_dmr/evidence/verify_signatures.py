@@ -190,14 +190,15 @@ def _events(signed: _Signed) -> Iterator[str]:
     stored = list(rows(signed.database, EVENTS))
     known = [entry.content_sha256 for entry in signed.of(EVENTS.kind)]
     found = [_content(row) for row in stored]
+    all_known, all_found = set(known), set(found)
     for row, sha256 in zip(stored, found, strict=True):
-        if sha256 not in known:
+        if sha256 not in all_known:
             yield f"the event {row['text']!r} was put in, or is not as it was signed"
-    if missing := len([sha256 for sha256 in known if sha256 not in found]):
+    if missing := len([sha256 for sha256 in known if sha256 not in all_found]):
         yield f"{missing} events are missing, or not as they were signed"
     if not missing and sorted(found) == sorted(known) and found != known:
         yield "the order of the events is not as it was signed"
-    if len(found) > len(set(found)):
+    if len(found) > len(all_found):
         yield "an event is there twice"
 
 
