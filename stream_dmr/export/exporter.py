@@ -227,16 +227,18 @@ class Export:
         Returns the number of boxes. Rejected fish and duplicates are left out.
         """
         self._require_writable(path, needed_for="--viame")
-        frames = messages_of(self.recording, Frame, self._selection)
-        steps = np.diff(np.array([frame.timestamp_ns for frame in frames], np.int64))
+        times_ns, pictures = list[int](), dict[int, str]()
+        for frame in messages_of(self.recording, Frame, self._selection):
+            times_ns.append(frame.timestamp_ns)
+            if is_picture(frame.source):
+                pictures[frame.frame_index] = frame.source
+        steps = np.diff(np.array(times_ns, np.int64))
         text, count = viame_csv(
             self._counted(),
             {fish.estimate.track_id: fish for fish in self._fish},
             self._template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
-            pictures={
-                frame.frame_index: frame.source for frame in frames if is_picture(frame.source)
-            },
+            pictures=pictures,
             is_part=not self._selection.is_everything,
         )
         with self._writing(path):

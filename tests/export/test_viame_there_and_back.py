@@ -82,3 +82,11 @@ def test_lengths_are_the_same(runs: list[Path], request: pytest.FixtureRequest):
     assert once == twice
     is_given = "given" in request.node.name
     assert once == (first if is_given else pytest.approx(first, rel=0.015))
+
+
+def test_boxes_of_a_folder_of_pictures_have_their_names(tmp_path: Path):
+    run = measure(tmp_path, source=str(tmp_path / "clip" / "masks"))
+    lines = exported(run, tmp_path / "export").read_text().splitlines()
+    rate, *boxes = (line for line in lines if not line.startswith("# 1:"))
+    assert rate == "# metadata,Fps: 30,fps: 30"
+    assert {line.split(",")[1] for line in boxes} == {f"{n:06d}.png" for n in range(1, 7)}
