@@ -86,7 +86,7 @@ class TrackLength:
         """
         self._measurements.append(measurement)
         count = len(self._measurements)
-        if self._filter is not None and count < self._filtered_whole + max(1, count // 8):
+        if self._filter is not None and count < self._filtered_whole + count // 8:
             self._filter.offer(measurement)
         else:
             self._filter = run_filter(self._measurements, self._settings)
