@@ -184,8 +184,11 @@ def test_keypoint_at_the_center_is_refused():
     midline = np.stack(
         [center, center + np.array([100.0, 10, 0]), center + np.array([200.0, 0, 0])]
     )
-    fish = localized(make_mesh(make_shape(midline, center, calibration.camera)), calibration)
+    shape = make_shape(midline, center, calibration.camera)
+    fish = localized(make_mesh(shape), calibration)
     assert (fish.reason, fish.length_mm) == (Reason.KEYPOINTS_COINCIDE, None)
+    hidden = localized(make_mesh(shape, quality=quality(visible_fraction=0.1)), calibration)
+    assert (hidden.reason, hidden.length_mm) == (Reason.MOSTLY_HIDDEN, None)  # the first reason
 
 
 def test_closed_midline_is_refused():
