@@ -267,6 +267,19 @@ def test_a_fish_that_comes_from_behind_a_gaff_may_be_either_of_two():
     assert hauled_behind_a_gaff(300.0, 342.0, later=36.0) == [[3]] * 6
 
 
+def test_a_fish_that_was_last_seen_at_the_edge_of_the_picture_has_left_it():
+    frames = [[(300, 50, 40, 100, 200)]] * 10 + [[]] * 10 + [[(300, 75, 40, 100, 200)]] * 5
+    assert ids(follow(frames, max_hidden_frames=30))[-5:] == [[2]] * 5
+
+
+def test_a_fish_keeps_its_id_behind_a_larger_one_for_longer_than_a_gap():
+    larger = (320, 240, 160, 200, 120)
+    passing = [(120 + 10 * i, 240, 40, 60, 200) for i in range(40)]
+    frames = [[larger, *([fish] if abs(fish[0] - 320) >= 100 else [])] for fish in passing]
+    assert sum(len(frame) == 1 for frame in frames) == 19
+    assert ids(follow(frames))[-5:] == [[1, 2]] * 5
+
+
 def test_dropped_frames_are_a_gap_like_any_other():
     frames = [[climbing(i)] for i in range(30)]
     kept = [i for i in range(1, 31) if i not in (9, 10, 11, 20)]
