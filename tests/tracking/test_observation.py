@@ -49,6 +49,14 @@ def test_a_box_that_nearly_reaches_the_edge_reaches_it(right: float, is_cut: boo
     assert not Observation(image, outlined).touches_border
 
 
+def test_a_single_pixel_has_a_length_to_divide_by():
+    speck = Candidate(
+        bbox_xyxy_px=np.array([5.0, 5, 6, 6]), score=1.0, foreground=np.ones((1, 1), bool)
+    )
+    observation = Observation(np.zeros((9, 9, 3), np.uint8), speck)
+    assert (observation.area, observation.length) == (1.0, 1.0)
+
+
 def test_a_piece_knows_the_box_of_the_whole():
     image = np.zeros((100, 100, 3), np.uint8)
     whole = Candidate(bbox_xyxy_px=np.array([20.0, 20, 80, 80]), score=1.0)

@@ -108,6 +108,7 @@ def test_boxes_alone_are_not_split():
     assert split_merged_blob(box, [predicted(fish(200, 120))]) == [box]
 
 
-def test_a_fish_that_has_gone_gets_no_piece_of_another():
-    gone, here = fish(250, 110), fish(250, 250)
+@pytest.mark.parametrize("y", [110, 170])  # at 170 half of where it would be is the other one
+def test_a_fish_that_has_gone_gets_no_piece_of_another(y):
+    gone, here = fish(250, y), fish(250, 250)
     assert len(split_merged_blob(candidate_of(here), [predicted(gone), predicted(here)])) == 1
