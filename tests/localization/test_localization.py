@@ -218,9 +218,10 @@ def test_plane_out_of_sight_is_refused(rotation_rad, translation_mm):
     assert (fish.accepted, fish.reason, fish.length_mm) == (False, Reason.PLANE_BEHIND_CAMERA, None)
 
 
-def test_lines_that_meet_on_the_wrong_side_are_refused():
+@pytest.mark.parametrize("direction", [(-1.0, 0, 0), (-50.0, 0, -1500)])  # of the center, camera
+def test_lines_that_meet_on_the_wrong_side_are_refused(direction):
     with pytest.raises(Unlocatable, match=Reason.KEYPOINTS_DISAGREE):
-        intersect(np.array([0.1, 0, 1.0]), np.array([0.0, 0, 1000]), np.array([-1.0, 0, 0]))
+        intersect(np.array([0.1, 0, 1.0]), np.array([0.0, 0, 1000]), np.array(direction))
 
 
 @pytest.mark.parametrize("field", ["keypoints", "keypoints_px", "midline"])
