@@ -114,6 +114,11 @@ def test_what_moves_for_hours_must_look_like_a_fish_in_a_tenth_of_its_frames():
     assert evidence_of(*often).looks_like_a_fish(2)
 
 
+def test_what_may_not_count_is_cut_out_at_first_and_then_in_a_quarter_of_its_frames():
+    due = [n for n in range(1, 21) if evidence_of(*[candidate()] * n).is_due]
+    assert due == [1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20]
+
+
 def test_closer_looks_count_as_looks_and_are_counted():
     evidence = evidence_of(*[candidate(looks=0.0)] * 5)
     for looks in (0.9, 0.0, 0.9):
