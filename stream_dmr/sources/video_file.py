@@ -27,6 +27,7 @@ _MAX_MS = 1e12  # 31 years
 _MIN_FPS, _MAX_FPS = 1e-3, 1e6
 _MAX_FRAMES = 1e12
 _NEAR_END = 3  # frames; at a variable rate the last frame may stand for longer
+_MAX_BACK_NS = 1_000_000_000  # chosen: rounding and reordered pictures step back by less
 _MATROSKA = b"\x1a\x45\xdf\xa3"  # and WebM
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 
@@ -42,6 +43,7 @@ class VideoFile(Source):
         self._timeout_s = settings.silence_s
         self._is_closed = False
         self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
+        self._later_ns = 0  # added to the times of the container since its clock went back
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
         self._may_have_gaps = start.startswith((_MATROSKA, b"RIFF"))  # or AVI
@@ -81,12 +83,7 @@ class VideoFile(Source):
             frame_index += 1
             if self._decoder.num_errors and not self._first_error:
                 self._first_error = frame_index
-            timestamp_ns = container_ns(
-                pending.milliseconds,
-                frame_index=frame_index,
-                fps=self.fps,
-                previous_ns=timestamp_ns,
-            )
+            timestamp_ns = self._time_ns(pending, frame_index, previous_ns=timestamp_ns)
             yield Frame(
                 frame_index=frame_index,
                 timestamp_ns=timestamp_ns,
@@ -104,6 +101,26 @@ class VideoFile(Source):
         self._is_closed = True
         self._first = None
         self._decoder.close()
+
+    def _time_ns(self, picture: DecodedPicture, frame_index: int, *, previous_ns: int) -> int:
+        """The time of a picture. Where files were joined, the clock goes on from the one before."""
+        if _is_time(picture.milliseconds):
+            back_ns = previous_ns - self._later_ns - round(picture.milliseconds * 1e6)
+            if back_ns > _MAX_BACK_NS:
+                if not self._later_ns:
+                    self._on_notice(
+                        f"{self.name}: its clock goes back by {back_ns / 1e9:.1f} s at frame "
+                        f"{frame_index}, as in files that were joined; times go on from the frame "
+                        "before, as if nothing lay between"
+                    )
+                self._later_ns += back_ns + nominal_ns(2, self.fps)
+        return container_ns(
+            picture.milliseconds,
+            frame_index=frame_index,
+            fps=self.fps,
+            previous_ns=previous_ns,
+            later_ns=self._later_ns,
+        )
 
     def _note_errors(self) -> None:
         """Warn once that FFmpeg conceals parts that it could not decode."""
@@ -150,8 +167,15 @@ class VideoFile(Source):
             )
 
 
-def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_ns: int) -> int:
-    """A container's timestamp as ns since the start of the stream, above `previous_ns`.
+def _is_time(milliseconds: float) -> bool:
+    """False for what OpenCV returns without a timestamp, and for an impossible one."""
+    return milliseconds != 0 and abs(milliseconds) < _MAX_MS
+
+
+def container_ns(
+    milliseconds: float, *, frame_index: int, fps: float, previous_ns: int, later_ns: int = 0
+) -> int:
+    """A container's timestamp, plus `later_ns`, as ns since the start, above `previous_ns`.
 
     OpenCV returns milliseconds as floats; rounded to whole ns they are exact, since a double is off
     by some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) If the container
@@ -159,10 +183,10 @@ def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_
     used. A time that repeats or steps back becomes 1 ns after the previous time, so that the
     correct times after it stay as they are.
     """
-    if milliseconds == 0 or not abs(milliseconds) < _MAX_MS:
-        timestamp_ns = nominal_ns(frame_index, fps)
+    if _is_time(milliseconds):
+        timestamp_ns = round(milliseconds * 1e6) + later_ns
     else:
-        timestamp_ns = round(milliseconds * 1e6)
+        timestamp_ns = nominal_ns(frame_index, fps)
     return max(timestamp_ns, previous_ns + 1)
 
 

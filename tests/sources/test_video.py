@@ -190,6 +190,21 @@ def test_timestamps_that_stand_still_or_step_back_are_pushed_on_without_drift():
     assert stamps(ms) == [0, 40_000_000, 40_000_001, 40_000_002, 120_000_000]
 
 
+def test_the_clock_goes_on_where_files_were_joined(tmp_path):
+    parts = [tmp_path / f"{number}.ts" for number in range(3)]
+    for part in parts:
+        write_video(part, codec="mp4v", num_frames=50)
+    joined = tmp_path / "joined.ts"
+    joined.write_bytes(b"".join(part.read_bytes() for part in parts))
+    opened, frames = read(joined)
+    times = np.array([frame.timestamp_ns for frame in frames])
+    assert len(times) > 140  # FFmpeg drops a picture at a seam
+    assert np.diff(times).min() > 20_000_000
+    assert abs(times[-1] - nominal_ns(len(times), 25.0)) < 200_000_000
+    [warning] = [line for line in opened.warnings if "goes back" in line]
+    assert "joined.ts: its clock goes back by" in warning
+
+
 @given(st.lists(st.floats(), max_size=20))
 def test_timestamps_strictly_increase_whatever_the_container_says(milliseconds):
     times = stamps(milliseconds)
