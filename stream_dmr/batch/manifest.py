@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
+from types import MappingProxyType
 from typing import get_type_hints
 
 from stream_dmr.errors import SourceError, UserError, reason_of
@@ -66,20 +67,27 @@ class Job:
 
 
 def read_manifest(
-    path: Path, *, config: Path | None, template: str, key: Path | None = None
+    path: Path,
+    *,
+    config: Path | None,
+    template: str,
+    key: Path | None = None,
+    earlier: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Job]:
     """The jobs of a manifest; relative paths start from the manifest's folder.
 
-    Raises UserError if it can't be read or lacks its columns. It is not checked that the files
-    that it names exist: a missing file fails its own video.
+    `earlier`: names that videos, by their paths, got by an earlier call; they keep them. Raises
+    UserError if it can't be read or lacks its columns. It is not checked that the files that it
+    names exist: a missing file fails its own video.
     """
-    rows = _rows(path)
-    names = _names([row["video"] or "" for row in rows])
+    rows, home = _rows(path), path.resolve().parent
+    videos = [row["video"] or "" for row in rows]
+    names = _names(videos, [earlier.get(str(home / video.strip())) for video in videos])
     mesh = template if not Path(template).is_file() else str(Path(template).resolve())
     files = {"config": config, "key": key}
     shared = {name: str(file.resolve()) for name, file in files.items() if file is not None}
     shared["template"] = mesh
-    jobs, home = [], path.resolve().parent
+    jobs = []
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
         if not row["video"] or None in row:
             raise UserError(
@@ -122,15 +130,21 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
     return rows
 
 
-def _names(videos: list[str]) -> list[str]:
+def _names(videos: list[str], earlier: list[str | None]) -> list[str]:
     """A folder name for each video: its file's name, with a number if the name occurs again.
 
-    No name ends with `.part`, which marks an unfinished folder.
+    A video that has an earlier name keeps it, also where other rows now come before it. No name
+    ends with `.part`, which marks an unfinished folder.
     """
     stems = [re.sub(r"[^A-Za-z0-9._-]+", "-", Path(v).stem).strip("-.") or "video" for v in videos]
-    seen, names, taken = Counter[str](), list[str](), set[str]()
-    for stem in stems:
+    seen, names, taken = Counter[str](), list[str](), {name for name in earlier if name}
+    kept = set[str]()
+    for stem, before in zip(stems, earlier, strict=True):
         name = stem = stem.removesuffix(".part") or "video"
+        if before and before not in kept:
+            kept.add(before)
+            names.append(before)
+            continue
         while name in taken:
             seen[stem] += 1
             name = f"{stem}-{seen[stem] + 1}"

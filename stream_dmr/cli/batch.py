@@ -75,9 +75,11 @@ def batch(
             Signer(key)  # refuses a wrong key before any video
         load_shapes(template)  # refuses an unreadable template before any video
         require_known_species(load_config(config).species)
-        if (out / VIDEOS).exists():
-            read_videos(out)  # refuses a table of no batch
-        jobs = read_manifest(manifest, config=config, template=template, key=key)
+        rows = read_videos(out) if (out / VIDEOS).exists() else []  # refuses a table of no batch
+        earlier = {
+            row["video"]: row["name"] for row in reversed(rows)
+        }  # the first of repeated ones
+        jobs = read_manifest(manifest, config=config, template=template, key=key, earlier=earlier)
         warn(repeated_videos(jobs))
         with (
             nullcontext(LocalEngine(workers or os.cpu_count() or 1))

@@ -73,6 +73,24 @@ def test_names_of_videos_are_unique_folder_names(
     assert all(Path(name).name == name and not name.endswith(".part") for name in names)
 
 
+def test_videos_of_equal_names_keep_their_folders_when_rows_come_and_go(tmp_path: Path):
+    def named(videos: list[str], earlier: dict[str, str]) -> dict[str, str]:
+        (tmp_path / "m.csv").write_text(HEADER + "".join(f"{v}/1.mp4,,,,,,\n" for v in videos))
+        jobs = read_manifest(tmp_path / "m.csv", config=None, template="cod", earlier=earlier)
+        assert len({job.name for job in jobs}) == len(jobs)
+        return {job.options.source: job.name for job in jobs}
+
+    def folders(names: dict[str, str]) -> dict[str, str]:
+        return {Path(source).parent.name: name for source, name in names.items()}
+
+    first = named(["a", "b"], {})
+    assert folders(first) == {"a": "1", "b": "1-2"}
+    assert folders(named(["b"], first)) == {"b": "1-2"}
+    second = named(["c", "b", "a"], first)
+    assert folders(second) == {"c": "1-3", "b": "1-2", "a": "1"}
+    assert len(named(["a", "d", "a", "b", "c"], second)) == 4  # a row that is given twice
+
+
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
     names = ("video.mp4", "calibration.yaml", "boxes.txt", "config.toml", "tiny.ply", "tiny.toml")
