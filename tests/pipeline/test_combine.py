@@ -1,12 +1,16 @@
 """Two runs of the same fish become one: paired by time and place, placed by both cameras."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
 import stream_dmr as sd
+from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
+from stream_dmr.camera import ReferencePlane
 from stream_dmr.errors import UserError
 from stream_dmr.geometry import box_iou
 from stream_dmr.localization.localize_fish import LocalizeSettings
@@ -221,6 +225,22 @@ def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
     )
     with pytest.raises(UserError, match="with --calibration"):
         replay(request, stop=threading.Event())
+
+
+def test_a_camera_that_was_turned_sideways_is_said(scene, combined, tmp_path):
+    """The rays still meet, but some way before the plane: lengths are 3 % short."""
+    assert "reference plane" not in combined.err
+    right = load_calibration(scene / SECOND / "calibration.yaml")
+    turn = Rotation.from_rotvec([0.0, np.radians(1.0), 0.0]).as_matrix()
+    plane = ReferencePlane(
+        rotation=turn @ right.plane.rotation, translation_mm=turn @ right.plane.translation_mm
+    )
+    save_calibration(tmp_path / "turned.yaml", replace(right, plane=plane))
+    options = f"--calibration {tmp_path / 'turned.yaml'} --from localize --out {tmp_path / 'run'}"
+    assert invoke(f"replay {scene / SECOND / 'run'} {options}").code == 0
+    result = invoke(f"combine {scene / 'run'} {tmp_path / 'run'} --out {tmp_path / 'both'}")
+    assert result.code == 0, result.err
+    assert "mm before the reference plane" in result.err
 
 
 def tracks(rng, degrees, offset_s):
