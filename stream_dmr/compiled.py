@@ -82,7 +82,10 @@ def users_cache(name: str, *, installed: Path) -> Path:
     compiled for this process alone, into a folder whose name nobody could know before.
     """
     cache = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # of a systemd service
-    base = Path(cache) if cache else _users_cache_base() / "stream-dmr"
+    try:
+        base = Path(cache) if cache else _users_cache_base() / "stream-dmr"
+    except RuntimeError:  # a user without HOME and without an entry in passwd, as in containers
+        return _own_cache("~/.cache", "no home folder; set XDG_CACHE_HOME")
     folder = base / name
     try:
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -91,14 +94,20 @@ def users_cache(name: str, *, installed: Path) -> Path:
             _fill(folder, installed)
         _require_private(folder)
     except OSError as error:
-        logging.getLogger("stream_dmr").warning(
-            "%s: expected a folder for compiled code that only this user can write to, got: %s; "
-            "compiling for this process alone",
-            folder,
-            error.strerror or error,
-        )
-        folder = Path(tempfile.mkdtemp(prefix="stream-dmr-"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return _own_cache(folder, error.strerror or error)
+    return folder
+
+
+def _own_cache(refused: Path | str, reason: object) -> Path:
+    """A folder for this process alone, with a warning why."""
+    logging.getLogger("stream_dmr").warning(
+        "%s: expected a folder for compiled code that only this user can write to, got: %s; "
+        "compiling for this process alone",
+        refused,
+        reason,
+    )
+    folder = Path(tempfile.mkdtemp(prefix="stream-dmr-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 

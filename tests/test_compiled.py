@@ -88,6 +88,15 @@ def test_a_folder_for_one_process_is_gone_with_it(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [no_folder]
 
 
+def test_a_user_without_any_home_compiles_for_one_process(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(os.path, "expanduser", str)  # no HOME, and no entry in passwd
+    assert users_cache(NAME, installed=cache / "none").is_dir()
+    assert "no home folder; set XDG_CACHE_HOME" in caplog.text
+
+
 CODE = """
 import os
 import sys
