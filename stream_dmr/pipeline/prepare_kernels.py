@@ -8,6 +8,7 @@ compiles the largest kernel of a descent, the second all kernels before and afte
 """
 
 import fcntl
+import os
 import subprocess
 import sys
 import time
@@ -98,8 +99,11 @@ def prepare_kernels(on_progress: Callable[[str], None], *, stop: Event) -> None:
 def _compile_all(folder: Path, on_progress: Callable[[str], None], *, stop: Event) -> None:
     began = time.monotonic()
     command = [sys.executable, "-P", "-m", __name__]
+    # A folder for this process alone is unknown to them: each would fill one of its own, in vain.
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)}
+    silent = subprocess.DEVNULL
     workers = [
-        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        subprocess.Popen([*command, part], env=environment, stdout=silent, stderr=silent)
         for part in _PARTS
     ]
     try:

@@ -3,6 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import pytest
 
@@ -77,3 +78,19 @@ def test_another_processor_compiles_anew(cache: Path):
     lines: list[str] = []
     prepare_kernels(lambda line: (lines.append(line), stop.set())[0], stop=stop)
     assert lines
+
+
+def test_workers_compile_into_the_folder_that_is_for_this_process_alone(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Each would make a folder of its own, and all that it compiled would go with it."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    look = "import sys, stream_dmr.compiled as c; (c.cache_folder() / sys.argv[1]).touch()"
+    real = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> "subprocess.Popen[bytes]":
+        return real([sys.executable, "-c", look, command[-1]], **options)
+
+    monkeypatch.setattr(module.subprocess, "Popen", start)
+    prepare_kernels(lambda line: None, stop=Event())
+    assert {"largest", "rest", "complete"} <= {path.name for path in cache.iterdir()}
