@@ -13,7 +13,13 @@ from typing import Protocol, runtime_checkable
 
 from stream_dmr.batch.dataset import publish, withdraw_others
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.measure_video import BatchProgress, Outcome, finish_folder, read_outcome
+from stream_dmr.batch.measure_video import (
+    BatchProgress,
+    Outcome,
+    finish_folder,
+    read_outcome,
+    reviewed_outcome,
+)
 from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.evidence.own_files import has_run_name
 from stream_dmr.evidence.seal import seal_files
@@ -104,6 +110,13 @@ class _BatchResults:
         self.outcomes = {
             name: outcome for name, outcome in known.items() if outcome and outcome.status == DONE
         }
+        for job in jobs:
+            if job.name not in self.outcomes and (outcome := reviewed_outcome(job, out)):
+                self.outcomes[job.name] = outcome
+                log(
+                    f"{job.name}: its inputs or stream-dmr changed, but reviewers gave verdicts: "
+                    f"it stays as it is; move {results_folder(job.name, out)} away to measure it again"
+                )
         for job in self._done():
             try:
                 publish(results_folder(job.name, out), job, out)

@@ -7,12 +7,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
 from stream_dmr.batch.manifest import Job
-from stream_dmr.errors import UserError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import add_files
 from stream_dmr.files import rename_durably
 from stream_dmr.pipeline.measure_source import measure_source
@@ -27,6 +28,8 @@ from stream_dmr.store.batch_folder import (
     unfinished_folder,
 )
 from stream_dmr.store.fish import run_notes
+from stream_dmr.store.schema import NAME as DATABASE
+from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.web.watch_observer import WatchObserver
 
 _LOG_EVERY_S = 5.0  # between two lines of progress
@@ -107,6 +110,17 @@ def read_outcome(job: Job, out: Path) -> Outcome | None:
     return next(
         (outcome for outcome in outcomes if outcome is not None and outcome.key == key), None
     )
+
+
+def reviewed_outcome(job: Job, out: Path) -> Outcome | None:
+    """What a job came to by other inputs, if reviewers gave verdicts on it; None without any."""
+    folder = results_folder(job.name, out)
+    outcome, database = _read_file(folder / OUTCOME), folder / DATABASE
+    if outcome is None or outcome.status != DONE or not database.exists():
+        return None
+    with suppress(OutputError):  # a damaged one is made again
+        return outcome if read_verdicts(database) else None
+    return None
 
 
 def _read_file(path: Path) -> Outcome | None:

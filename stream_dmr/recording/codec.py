@@ -33,6 +33,7 @@ from PIL import Image
 from stream_dmr import messages
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import RecordingError
+from stream_dmr.recording.selection import Selection
 
 PACKAGE = "stream_dmr"
 _FILE = "stream_dmr/recording/messages.proto"  # its name inside recordings; must not change
@@ -246,6 +247,16 @@ def decode(kind: type[T], data: bytes) -> T:
     The image of a Frame recorded by reference has the shape (0, 0, 3). Raises RecordingError if the
     bytes are no such message.
     """
+    return _build(kind, _parsed(kind, data))
+
+
+def decode_selected(kind: type[T], data: bytes, selection: Selection) -> T | None:
+    """The same, or None if it is not selected, which is known before its arrays are unpacked."""
+    proto = _parsed(kind, data)
+    return _build(kind, proto) if selection.includes(proto) else None
+
+
+def _parsed(kind: type, data: bytes) -> Proto:
     proto = proto_class(kind.__name__)()
     try:
         proto.ParseFromString(data)
@@ -253,7 +264,7 @@ def decode(kind: type[T], data: bytes) -> T:
         raise RecordingError(
             f"expected a {kind.__name__} in the recording, found other bytes: it is damaged"
         ) from error
-    return _build(kind, proto)
+    return proto
 
 
 def stored_picture(frame: bytes) -> EncodedPicture:

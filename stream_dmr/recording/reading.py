@@ -13,7 +13,7 @@ from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.files import natural_order
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import Frame, LearntShapes, LocalizedFish, Message
-from stream_dmr.recording.codec import decode
+from stream_dmr.recording.codec import decode_selected
 from stream_dmr.recording.header import RunHeader, joined_runs
 from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
@@ -100,8 +100,8 @@ def decoded_messages(
 ) -> Iterator[tuple[Message, bytes]]:
     """The selected messages of a recording, each with its encoding. Raises RecordingError."""
     for kind, payload in recording.payloads(kinds, selection, of=of):
-        message = decode(kind, payload)
-        if selection.includes(message):
+        message = decode_selected(kind, payload, selection)
+        if message is not None:
             yield message, payload
 
 
@@ -109,8 +109,10 @@ def messages_of(
     recording: Recording, kind: type[M], selection: Selection = EVERYTHING
 ) -> Iterator[M]:
     """The selected messages of one kind. Raises RecordingError."""
-    decoded = (decode(kind, payload) for _, payload in recording.payloads([kind], selection))
-    return filter(selection.includes, decoded)
+    for _, payload in recording.payloads([kind], selection):
+        message = decode_selected(kind, payload, selection)
+        if message is not None:
+            yield message
 
 
 def files_of(path: Path) -> list[Path]:

@@ -105,7 +105,10 @@ class VideoFile(Source):
     def _time_ns(self, picture: DecodedPicture, frame_index: int, *, previous_ns: int) -> int:
         """The time of a picture. Where files were joined, the clock goes on from the one before."""
         if _is_time(picture.milliseconds):
-            back_ns = previous_ns - self._later_ns - round(picture.milliseconds * 1e6)
+            time_ns = round(picture.milliseconds * 1e6)
+            if self._later_ns and 0 < time_ns - previous_ns < _MAX_BACK_NS:
+                self._later_ns = 0  # a single wrong time lay between
+            back_ns = previous_ns - self._later_ns - time_ns
             if back_ns > _MAX_BACK_NS:
                 if not self._later_ns:
                     self._on_notice(

@@ -301,6 +301,23 @@ def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tm
     assert {one["video"] for one in tables} == {job.name for job in jobs}
 
 
+def test_a_reviewed_video_is_not_measured_again_by_other_inputs(season: Path, tmp_path: Path):
+    lines = [row("clip"), row("other")]
+    out, said = tmp_path / "out", list[str]()
+    measure(jobs_of(season, tmp_path, *lines), out)
+    verdict = Verdict(track_id=2, kind="accept", reviewer="Ada")
+    add_verdict(results_folder("video", out) / "lengths.db", verdict)
+    moved = jobs_of(season, tmp_path, *(line | {"trip": "8"} for line in lines))
+    summary = run_batch(moved, out, ThisProcess(), stop=threading.Event(), log=said.append)
+    assert (summary.num_before, [one.status for one in summary.outcomes]) == (1, ["done"] * 2)
+    stored = [
+        read_stored_fish(results_folder(one, out) / "lengths.db") for one in ("video", "video-2")
+    ]
+    assert [fish[0].facts.trip for fish in stored] == ["7", "8"]
+    [line] = [line for line in said if "verdicts" in line]
+    assert "video: its inputs or stream-dmr changed, but reviewers gave verdicts" in line
+
+
 def test_the_next_call_takes_verdicts_and_checks_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import wave
 from collections import deque
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import SourceError
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.sources.decoder import Decoder
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings, nominal_ns
 from stream_dmr.sources.video_file import VideoFile, container_ns
@@ -203,6 +205,20 @@ def test_the_clock_goes_on_where_files_were_joined(tmp_path):
     assert abs(times[-1] - nominal_ns(len(times), 25.0)) < 200_000_000
     [warning] = [line for line in opened.warnings if "goes back" in line]
     assert "joined.ts: its clock goes back by" in warning
+
+
+def test_a_single_wrong_time_leaves_those_after_it_as_they_are(tmp_path, monkeypatch):
+    write_video(tmp_path / "video.mp4", codec="mp4v", num_frames=80)
+    sound, numbers = Decoder.read, itertools.count()
+
+    def with_a_wrong_time(decoder, **given):
+        picture = sound(decoder, **given)
+        return replace(picture, milliseconds=200.0) if next(numbers) == 60 else picture
+
+    monkeypatch.setattr(Decoder, "read", with_a_wrong_time)
+    _, frames = read(tmp_path / "video.mp4")
+    expected = [nominal_ns(number, 25.0) for number in range(1, 81)]
+    assert [frame.timestamp_ns for frame in frames] == pytest.approx(expected, abs=1e7)
 
 
 @given(st.lists(st.floats(), max_size=20))
