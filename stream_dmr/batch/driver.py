@@ -115,7 +115,7 @@ class _BatchResults:
                 self.outcomes[job.name] = outcome
                 log(
                     f"{job.name}: its inputs or stream-dmr changed, but reviewers gave verdicts: "
-                    f"it stays as it is; move {results_folder(job.name, out)} away to measure it again"
+                    f"it stays; move {results_folder(job.name, out)} away to measure it again"
                 )
         for job in self._done():
             try:
