@@ -76,9 +76,7 @@ def batch(
         load_shapes(template)  # refuses an unreadable template before any video
         require_known_species(load_config(config).species)
         rows = read_videos(out) if (out / VIDEOS).exists() else []  # refuses a table of no batch
-        earlier = {
-            row["video"]: row["name"] for row in reversed(rows)
-        }  # the first of repeated ones
+        earlier = {row["video"]: row["name"] for row in reversed(rows)}  # first of repeats
         jobs = read_manifest(manifest, config=config, template=template, key=key, earlier=earlier)
         warn(repeated_videos(jobs))
         with (
