@@ -26,7 +26,7 @@ from stream_dmr.messages import (
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, open_pictures
 from stream_dmr.recording.reading import Recording, decoded_messages, part_at, recorded_settings
-from stream_dmr.recording.selection import EVERYTHING
+from stream_dmr.recording.selection import Selection
 from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.source import ReadFramesSettings
@@ -109,14 +109,17 @@ def frame_images(
     If `source` is not the recorded source, SourceError is raised if the user gave it (`is_given`);
     else its frames are left out.
     """
+    if not wanted:
+        return
     checked = nullcontext() if is_given else suppress(SourceError)
+    selection = Selection(time_ns=(min(wanted), max(wanted) + 1))
     if source is None:
-        opened = nullcontext(RecordedPictures(recording, EVERYTHING))
+        opened = nullcontext(RecordedPictures(recording, selection))
     else:
         settings = recorded_settings(recording.header, "read_frames", ReadFramesSettings)
         opened = open_pictures(source, settings)
     with checked, opened as pictures:
-        for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
+        for message, payload in decoded_messages(recording, [Frame], selection):
             if message.timestamp_ns in wanted and isinstance(message, Frame):
                 with checked:
                     frame = pictures.restore(message, payload)
