@@ -20,6 +20,7 @@ from stream_dmr.store.fish import read_fish
 from stream_dmr.store.open_results import open_results
 from stream_dmr.store.run_tables import FrameRow
 from stream_dmr.store.scale_checks import last_checks
+from stream_dmr.store.schema import HAULS, read_rows
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.tables import column_kinds, read_records
@@ -44,13 +45,14 @@ def write_tables(folder: Path, job: Job) -> None:
     recording = open_results(folder, template=job.options.template)
     settings = load_config(job.options.config).fisheries
     fish = read_fish(folder, recording)
-    of_video = {"video": job.name, "haul": job.options.haul}
+    of_video = {"video": job.name}
     checks = last_checks(folder / DATABASE)
     template = recording.header.template
     records = [fish_record(measured, template, settings, checks) | of_video for measured in fish]
     write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
     by_track = {
-        measured.estimate.track_id: {"run_id": measured.run_id} | asdict(measured.facts)
+        measured.estimate.track_id: asdict(measured.facts)
+        | {"run_id": measured.run_id, "haul": measured.haul}
         for measured in fish
     }
     frames = read_records(folder / "frames.csv", FrameRow)
@@ -62,8 +64,8 @@ def write_tables(folder: Path, job: Job) -> None:
 def publish(folder: Path, job: Job, out: Path) -> None:
     """Copy the tables of a finished video into the data set. Idempotent.
 
-    They are written again if a reviewer has added verdicts or the scale was checked since, or if a
-    table is gone.
+    They are written again if verdicts, checks of the scale or hauls came since, or if a table is
+    gone.
     """
     written_ns = min(_written_ns(folder, kind) for kind in TABLE_KINDS)
     if not written_ns or _last_addition_ns(folder) > written_ns:
@@ -98,11 +100,13 @@ def _written_ns(folder: Path, kind: str) -> int:
 
 
 def _last_addition_ns(folder: Path) -> int:
-    """Time of the last verdict or check of the scale, ns since 1970; 0 without any."""
+    """Time of the last verdict, check of the scale or haul, ns since 1970; 0 without any."""
     try:
         verdicts = read_verdicts(folder / DATABASE)
         checks = last_checks(folder / DATABASE).values()
+        hauls = read_rows(folder / DATABASE, HAULS)
     except OutputError:  # which `verify` reports
         return 0
     times = [verdict.written_ns for verdict in verdicts] + [check.time_ns for check in checks]
+    times += [haul["written_ns"] for haul in hauls]
     return max(times, default=0)

@@ -9,6 +9,7 @@ from pyarrow import parquet
 
 from stream_dmr.batch.dataset import publish, withdraw_others, write_tables
 from stream_dmr.batch.manifest import Job
+from stream_dmr.pipeline.haul_log import write_haul
 from stream_dmr.store.batch_folder import TABLE_KINDS
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from tests.support.command import rows
@@ -70,6 +71,17 @@ def test_without_its_recording_a_video_still_takes_verdicts(folder: Path, tmp_pa
         for name in of_review:
             one.pop(name)
     assert after == before
+
+
+def test_fish_have_the_haul_that_was_told_since(folder: Path, tmp_path: Path):
+    told = Path(shutil.copytree(folder, tmp_path / "told"))
+    end_s = float(rows(told / "lengths.csv")[-1]["last_time"])
+    write_haul(told, "start", name="9", at="0", said_by="Ada")
+    write_haul(told, "end", name="", at=str(end_s + 1), said_by="Ada")
+    publish(told, JOB, tmp_path)
+    for kind in TABLE_KINDS:
+        table = parquet.read_table(told / f"{kind}.parquet").to_pylist()
+        assert {row["haul"] for row in table} == {"9"}
 
 
 def test_files_of_videos_that_are_not_finished_go(folder: Path, tmp_path: Path):
