@@ -46,8 +46,8 @@ class ZonesSettings(Settings):
     max_gap_s: float = Field(
         default=0.5,
         ge=0,
-        description="a fish that was hidden, or not fitted, for longer before its track ended has "
-        "an unknown fate; so has one in view within this time of the end, s",
+        description="a fish that was not fitted for longer before its track ended has an unknown "
+        "fate; so has one in view within this time of the end, s",
     )
 
     @field_validator(*FATE_OF_ZONE)
