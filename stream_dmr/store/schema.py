@@ -134,7 +134,8 @@ CREATE TABLE added_frames (
 CREATE TABLE chain (
     number INTEGER PRIMARY KEY, -- from 1, without gaps
     previous TEXT NOT NULL, -- SHA-256 of the entry before it
-    -- of what: fish, event, run, end, file, found, removed, state, checks
+    -- of what: a table's row (fish, event, run, haul, watched, position, checks), or end, state,
+    -- file, found, removed
     kind TEXT NOT NULL, name TEXT NOT NULL,
     content_sha256 TEXT NOT NULL,
     time_ns INTEGER NOT NULL, -- wall clock
