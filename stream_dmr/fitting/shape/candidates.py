@@ -191,7 +191,7 @@ _WORTH_SAYING = 0.02  # of a log factor: smaller differences are called none
 
 
 def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
-    """A line for each stock, such as: 62 % of the fish: like salmon, 18 % broader (+-3 %)."""
+    """A line for each stock, such as: 62% of the fish: like salmon, 18% broader (+-3%)."""
     by_name = {form.name: form for form in forms}
     for stock in stocks:
         yield _line(by_name[stock.name], stock)
