@@ -142,7 +142,7 @@ class HaulLog:
 
     def finish(self) -> None:
         with self._lock:
-            self._write_watched()
+            self._write_watched(is_urgent=True)  # the digest of the last day reads it at once
             self._end_ruled(self._last_fish_ns)
 
     def _end_ruled(self, timestamp_ns: int) -> None:
@@ -169,10 +169,10 @@ class HaulLog:
         self._watched["frames"] += 1
         self._watched["frames_lost"] += new_lost
 
-    def _write_watched(self) -> None:
+    def _write_watched(self, *, is_urgent: bool = False) -> None:
         if self._watched is not None:
             name = str(self._watched["first_ns"])
-            self._store.append(WATCHED, name, self._watched, is_urgent=False)
+            self._store.append(WATCHED, name, self._watched, is_urgent=is_urgent)
         self._watched = None
 
 

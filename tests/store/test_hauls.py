@@ -64,6 +64,8 @@ def test_a_run_that_is_told_of_hauls(tmp_path: Path):
             names.append(log.mark(*told[second], said_by="Ada"))
     current = log.current()
     log.finish()
+    watched = read_rows(store.path, WATCHED)  # as the digest of the last day reads it
+    assert sum(row["last_ns"] - row["first_ns"] for row in watched) == 600 * SECOND
     for track_id, time_s in enumerate((30, 120, 200, 400), start=1):
         store.add(at(track_id, time_s))
     store.close()
