@@ -25,7 +25,9 @@ def export(
     meshes: Annotated[
         MeshFormat | None, "A mesh per fish and frame, in mm, in the camera frame."
     ] = None,
-    masks: Annotated[bool, "masks.json: masks, head and tail of the fish that count, as COCO."] = False,
+    masks: Annotated[
+        bool, "masks.json: masks, head and tail of the fish that count, as COCO."
+    ] = False,
     tables: Annotated[TableFormat | None, "lengths, and frames with the keypoints."] = None,
     fish: Annotated[
         TableFormat | None,
