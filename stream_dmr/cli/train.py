@@ -19,7 +19,7 @@ def train(
         Path | None, "Folder of a .png per image, values are fish ids; or a COCO .json."
     ] = None,
     backgrounds: Annotated[
-        Path | None, "Folder of photographs without fish, to put your own fish before."
+        Path | None, "Folder of photographs without fish, to put fish before."
     ] = None,
     init: Annotated[
         Path | None, "Weights to start from; with --images the shipped ones unless given."
