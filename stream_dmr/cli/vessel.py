@@ -120,8 +120,8 @@ def fleet(
         list[str],
         typer.Argument(
             help="Addresses of status pages, such as http://10.0.0.7:8480/, digests or folders of "
-            "a box's digests, or files with one NAME ADDRESS a line; FILE.pub after digests checks "
-            "their signature.",
+            "a box's digests, or files with one NAME ADDRESS a line, where FILE.pub after digests "
+            "checks their signature.",
             metavar="URL|FILE|DIR...",
         ),
     ],
