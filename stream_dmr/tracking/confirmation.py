@@ -1,4 +1,4 @@
-"""Confirm a track as a fish once it was clearly segmented in enough frames inside the zone.
+"""Confirm a track as a fish once it is inside the zone and was clearly segmented in enough frames.
 
 The tracker follows all that moves. Gaffs and waves are distinguished from fish by their masks,
 which are empty or of low confidence.
