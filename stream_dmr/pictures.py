@@ -63,7 +63,11 @@ def read_picture(path: Path, flags: int) -> np.ndarray | None:
         content = file.read()
     if not content or is_cut_off(content):
         return None
-    return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:  # OpenCV would print a line for each picture of floats or of 32 bits
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def is_cut_off(content: bytes) -> bool:

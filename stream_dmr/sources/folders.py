@@ -62,17 +62,14 @@ class PictureFolder(Source):
         first = next((p for p in map(self._read, self._paths) if p is not None), None)
         if first is None:
             raise SourceError(
-                f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
+                f"{folder}: expected pictures of 8 or 16 bits, but none of its {len(self._paths)} "
+                "can be decoded"
             )
         self.height, self.width = first.shape[:2]
         if other_sizes == "leave_out":  # the first picture may be of another telephone
             sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
             self.height, self.width = max(sizes, key=lambda size: sizes[size])
-        # Sensors of 12 bits often write their values unscaled into 16 bits, which look all but
-        # black. A folder is taken for 12 bits if a sample of it stays below 4096.
-        self._white = 2**16 - 1
-        if first.dtype == np.uint16 and all(p.max() < 2**12 for p in self._sample()):
-            self._white = 2**12 - 1
+        self._white: int | None = None  # of 16-bit pictures, known from the first one on
 
     def __iter__(self) -> Iterator[Frame]:
         for frame_index, path in enumerate(self._paths, start=1):
@@ -105,6 +102,7 @@ class PictureFolder(Source):
                 )
                 continue
             if picture.dtype != np.uint8:  # one factor for the whole folder: it must not flicker
+                self._white = self._white or self._white_of(picture)
                 picture = cv2.convertScaleAbs(picture, alpha=255 / self._white)
             yield Frame(
                 frame_index=frame_index,
@@ -131,6 +129,15 @@ class PictureFolder(Source):
         except OSError:
             return None
         return picture if picture is not None and picture.dtype.name in _DEPTHS else None
+
+    def _white_of(self, picture: np.ndarray) -> int:
+        """The value of white in 16-bit pictures of the folder, such as `picture`.
+
+        Sensors of 12 bits often write their values unscaled into 16 bits, which look all but black.
+        A folder is taken for 12 bits if a sample of it stays below 4096.
+        """
+        is_dim = all(p.max() < 2**12 for p in (picture, *self._sample()))
+        return 2**12 - 1 if is_dim else 2**16 - 1
 
     def _sample(self) -> Iterator[np.ndarray]:
         """About five pictures, evenly spaced, without unreadable pictures."""

@@ -78,6 +78,13 @@ def test_12_bits_in_16_are_not_read_as_night(tmp_path):
     assert [int(f.image.max()) for f in frames] == [0, 255, 128]
 
 
+def test_12_bits_after_a_picture_of_8_are_not_read_as_night(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((20, 30), 100, np.uint8))  # by another program
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((20, 30), 4095, np.uint16))
+    _, frames = read(tmp_path)
+    assert [int(f.image.max()) for f in frames] == [100, 255]
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 @pytest.mark.parametrize("turn", [3, 6])
 def test_a_picture_is_turned_upright_or_as_the_sensor_saw_it(tmp_path, suffix, turn):
@@ -127,6 +134,13 @@ def test_refuses_folders_without_pictures(tmp_path):
     assert "none of its 1 can be decoded" in refusal(tmp_path)
     (tmp_path / "1.png").rename(tmp_path / "1.mp4")
     assert "1.mp4: expected a video" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_pictures_of_other_depths_give_one_line(tmp_path, capfd, kind):
+    Image.fromarray(np.zeros((20, 30), kind)).save(tmp_path / "1.tif")
+    assert "expected pictures of 8 or 16 bits" in refusal(tmp_path)
+    assert capfd.readouterr().err == ""
 
 
 def test_the_size_of_most_pictures_counts_where_others_are_left_out(tmp_path):
