@@ -209,18 +209,20 @@ class TrackEditor:
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
         measured = [caught.estimate for caught in read_measured_fish(self._database)]
         last = {estimate.track_id: estimate.last_frame for estimate in measured}
+        seen = {estimate.track_id: estimate.frames_seen for estimate in measured}
         frames = frames_of_tracks(report.recording, self._database, tracks, last)
         flags = {caught.estimate.track_id: caught.flags for caught in report.fish}
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
+            for track_id in (part.track_id for part in of_fish):
+                found, expected = len(frames[track_id]), seen.get(track_id, 1)
+                if found < expected:
+                    raise UserError(
+                        f"verdict: expected {expected} frames of fish {track_id} in the recording, "
+                        f"found {found or 'none'}: a segment is gone, as after a disk that ran "
+                        "short; the fish can only be accepted, rejected or a duplicate"
+                    )
             chosen = frames_of_parts(frames, of_fish, fish=fish)
-            gone = [part.track_id for part in of_fish if not frames[part.track_id]]
-            if gone or not chosen:
-                raise UserError(
-                    f"verdict: expected frames of fish {(gone or [fish])[0]} in the recording, "
-                    "found none: its segment is gone, as after a disk that ran short; the fish can "
-                    "only be accepted, rejected or a duplicate"
-                )
             known = [*flags.get(fish, ())]
             known += [flag for part in of_fish for flag in flags.get(part.track_id, ())]
             kept = list(dict.fromkeys(known))

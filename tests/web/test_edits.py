@@ -283,6 +283,25 @@ def test_what_can_not_be_done_is_refused_and_not_kept(
     assert len(read_stored_fish(out / "lengths.db")) == 2
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"kind": "split", "track_id": 1, "frame_index": 3},
+        {"kind": "merge", "track_id": 2, "other_fish": 1},
+    ],
+)
+def test_a_fish_is_not_made_of_a_part_of_the_frames_that_were_measured(
+    queue: ReviewQueue, out: Path, said: dict[str, Any]
+):
+    """As after segments of its track were deleted: its other segments are still there."""
+    with closing(sqlite3.connect(out / "lengths.db")) as edited:
+        edited.execute("UPDATE fish SET frames_seen = 8 WHERE track_id = 1")
+        edited.commit()
+    with pytest.raises(UserError, match="expected 8 frames of fish 1 in the recording, found 5"):
+        submit(queue, **said)
+    assert read_verdicts(out / "lengths.db") == []
+
+
 def test_a_fish_with_moved_points_is_not_split(queue: ReviewQueue, out: Path):
     frame = queue.detail(0, 1)["views"][0]
     head, _, tail = frame["keypoints"]
