@@ -187,6 +187,14 @@ def exit_codes() -> Generator[None]:
         print(error.format_message() if is_help else _usage_line(error), file=sys.stderr)
         sys.exit(2)
     except Exception as error:
+        # Python has no type for the second.
+        if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+            print(
+                f"error: expected more memory or threads, got: {str(error) or 'no memory'}; end "
+                "other programs, or raise `ulimit -v`, `ulimit -u` or the container's limits",
+                file=sys.stderr,
+            )
+            sys.exit(2)
         traceback.print_exc()
         print(
             f"error: stream-dmr broke down ({type(error).__name__}); this is not your fault, "

@@ -191,3 +191,12 @@ def test_a_signal_that_a_library_swallowed_still_ends_the_command():
         command()
     assert heard == [signal.SIGTERM, signal.SIGINT]
     assert ended.value.code == 128 + signal.SIGTERM
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_too_little_memory_is_one_line(capsys: pytest.CaptureFixture[str], error: Exception):
+    with pytest.raises(SystemExit) as ended, exit_codes():
+        raise error
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected more memory or threads" in line
