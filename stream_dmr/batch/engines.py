@@ -30,6 +30,7 @@ from stream_dmr.batch.measure_video import (
     measure_video,
     read_outcome,
 )
+from stream_dmr.compiled import cache_folder
 from stream_dmr.errors import UserError, requires_extra
 
 FINISHED = "finished"
@@ -153,7 +154,8 @@ class _Worker:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},  # one core a video
+            # One core a video, and kernels of which a folder for one process alone is made once.
+            env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": str(cache_folder())},
             start_new_session=True,  # Ctrl-C goes to the batch alone
         )
 

@@ -13,6 +13,7 @@ import time
 from ast import literal_eval
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pandas
 import pytest
@@ -482,6 +483,25 @@ def test_a_process_measures_so_many_videos(season: Path, tmp_path: Path):
     outcomes = engine.outcomes(jobs, tmp_path, stop=threading.Event(), progress=progress)
     assert sorted(outcome.name for outcome in outcomes) == ["one", "three", "two"]
     assert len(seen) == 2
+
+
+def test_processes_share_the_folder_of_compiled_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Without a cache that can be written to, each had compiled all for itself, a minute long."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr("stream_dmr.compiled._cache_folder", lambda: tmp_path / "own")
+    given, real = list[str](), subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> "subprocess.Popen[str]":
+        given.append(options["env"].get("NUMBA_CACHE_DIR"))
+        return real([sys.executable, "-c", ""], **options)
+
+    monkeypatch.setattr("stream_dmr.batch.engines.subprocess.Popen", start)
+    job = Job(name="1", given={"source": str(tmp_path / "1.mp4")})
+    progress = BatchProgress([job], lambda line: None)
+    list(LocalEngine(1).outcomes([job], tmp_path, stop=threading.Event(), progress=progress))
+    assert given == [str(tmp_path / "own")]
 
 
 def test_a_stopped_batch_leaves_nothing_unfinished(season: Path, tmp_path: Path):
