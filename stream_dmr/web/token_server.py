@@ -259,7 +259,7 @@ class _Handler(BaseHTTPRequestHandler):
 
         DNS rebinding: if a page's own name resolves to an address of this machine, that page can
         read answers without a token. So a server for this machine alone accepts only names of this
-        machine. `Origin`, if the browser sends it, is the origin of the page.
+        machine. `Origin`, if the browser sends it, is the origin of the page: https before a proxy.
         """
         host, origin = self.headers.get("Host"), self.headers.get("Origin")
         if host is not None and self.server.is_local:
@@ -269,7 +269,7 @@ class _Handler(BaseHTTPRequestHandler):
                 return False
             if name is None or not is_loopback(name):
                 return False
-        return origin is None or origin == f"http://{host}"
+        return origin is None or origin in (f"http://{host}", f"https://{host}")
 
     @property
     def _cookie_name(self) -> str:

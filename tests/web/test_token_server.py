@@ -130,6 +130,8 @@ def test_a_server_for_others_answers_to_every_name_with_the_token():
         with_token = {"Authorization": "Bearer secret"}
         assert status_of(server, Host="camera.vessel") == 401
         assert status_of(server, Host="camera.vessel", **with_token) == 200
+        by_proxy = with_token | {"Origin": "https://camera.vessel"}
+        assert status_of(server, method="POST", Host="camera.vessel", **by_proxy) == 200
         elsewhere = with_token | {"Origin": "http://rebound.example"}
         assert status_of(server, Host="camera.vessel", **elsewhere) == 403
 
