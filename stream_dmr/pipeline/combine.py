@@ -6,6 +6,7 @@ same moment is placed by both cameras, any other fish by the first camera alone.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, Topics
 
 _MOST_APART_S = 0.25  # between two pictures of a fish, to interpolate between them
 _MOST_OFFSET_S = 10.0  # of the two cameras' clocks; the range that is searched
+_MOST_DRIFT = 0.002  # the range that is searched; 29.97 frames/s that are taken for 30 make 0.001
 _FRAMES = 12  # of a track that are compared
 _COMPARED = 24  # tracks by which the clocks are compared
 _FEWEST = 3  # frames that two tracks must share to be one fish
@@ -177,11 +179,23 @@ class CommonMeshes:
         return self._fitter.fit(Sight(*own, np.zeros(3)), Sight(*seen, rays[0] - rays[1]))
 
 
+class Clocks(NamedTuple):
+    """The second camera's clock by the first's."""
+
+    offset_s: float  # the second minus the first, at `pivot_ns`
+    drift: float = 0.0  # what the second gains, s in a second
+    pivot_ns: int = 0  # of the first
+
+    def second_ns(self, first_ns: int) -> int:
+        gained_ns = self.drift * (first_ns - self.pivot_ns)
+        return first_ns + round(self.offset_s * 1e9 + gained_ns)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pairing:
     """The fish of two runs that are the same."""
 
-    offset_s: float  # the second camera's clock minus the first's
+    clocks: Clocks
     ids: Mapping[int, Sequence[int]]  # of the second run, by the ids of the first
     apart: float  # of the rays to a fish's ends, over its length: median of all pairs
 
@@ -193,23 +207,42 @@ def pair_up(
     *,
     frame_s: float,
 ) -> Pairing:
-    """Pair the fish, at the offset of the clocks at which most rays meet.
+    """Pair the fish, at the offset and the drift of the clocks at which most rays meet.
 
-    Every offset up to 10 s is tried in steps of half a frame, then finer around the best. If one
-    camera's track broke off and continued as another track, both are the other camera's fish.
+    Every offset up to 10 s is tried in steps of half a frame, then finer around the best; then
+    every drift, which turns the clocks about the fish that met. If one camera's track broke off and
+    continued as another track, both are the other camera's fish.
     """
     some = {fish: first[fish] for fish in evenly([*first], _COMPARED)}
 
-    def cost(offset_s: float) -> float:
-        apart = _apart(some, second, calibrations, offset_s)
-        return float(apart[linear_sum_assignment(apart)].sum())
+    def best(offsets_s: Iterable[float], drifts: Iterable[float], pivot_ns: int = 0) -> Clocks:
+        """The clocks at which most rays meet; of equal ones, the first."""
 
-    steps = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, frame_s / 2)
-    best = min(sorted(steps.tolist(), key=abs), key=cost)  # of equal costs, the smallest offset
-    for step in (frame_s / 4, frame_s / 10, frame_s / 40):
-        finer = [best + step * n for n in sorted(range(-4, 5), key=abs)]
-        best = min(finer, key=cost)
-    apart = _apart(first, second, calibrations, best)
+        def cost(clocks: Clocks) -> float:
+            apart = _apart(some, second, calibrations, clocks)
+            return float(apart[linear_sum_assignment(apart)].sum())
+
+        tried = (Clocks(*clocks, pivot_ns) for clocks in product(offsets_s, drifts))
+        return min(tried, key=cost)
+
+    finer = (frame_s / 4, frame_s / 10, frame_s / 40)
+    clocks = best(_around(0.0, frame_s / 2, _MOST_OFFSET_S), [0.0])
+    for step_s in finer:
+        clocks = best(_around(clocks.offset_s, step_s, 4 * step_s), [0.0])
+    apart = _apart(first, second, calibrations, clocks)
+    middles_ns = np.array([track.times_ns[len(track.times_ns) // 2] for track in first.values()])
+    if (meets := (apart < _MOST_RAYS_APART).any(axis=1)).any():
+        pivot_ns, middle_ns = (int(np.median(of)) for of in (middles_ns[meets], middles_ns))
+        span_s = float(np.abs(middles_ns - pivot_ns).max()) / 1e9
+        if _MOST_DRIFT * span_s >= frame_s / 2:
+            drifts = _around(0.0, frame_s / 2 / span_s, _MOST_DRIFT)
+            clocks = best([clocks.offset_s], drifts, pivot_ns)
+            offset_s, drift = (clocks.second_ns(middle_ns) - middle_ns) / 1e9, clocks.drift
+            for step_s in finer:
+                offsets_s = _around(offset_s, step_s, 4 * step_s)
+                drifts = _around(drift, step_s / span_s, 4 * step_s / span_s)
+                offset_s, drift, _ = clocks = best(offsets_s, drifts, middle_ns)
+            apart = _apart(first, second, calibrations, clocks)
     ids, other_ids = [*first], [*second]
     best_pairs = [*zip(*(axis.tolist() for axis in linear_sum_assignment(apart)), strict=True)]
     meeting = np.argwhere(apart < _MOST_RAYS_APART).tolist()
@@ -221,17 +254,23 @@ def pair_up(
         if apart[r, c] < _MOST_RAYS_APART and are_free:
             found.append((r, c))
     return Pairing(
-        offset_s=best,
+        clocks=clocks,
         ids={ids[r]: [other_ids[c] for row, c in found if row == r] for r, _ in found},
         apart=float(np.median([apart[r, c] for r, c in found])) if found else np.nan,
     )
+
+
+def _around(middle: float, step: float, reach: float) -> list[float]:
+    """Evenly spaced values, the nearest to the middle first."""
+    most = int(reach / step + 1e-9)
+    return [middle + step * n for n in sorted(range(-most, most + 1), key=abs)]
 
 
 def _apart(
     first: Mapping[int, FishSightings],
     second: Mapping[int, FishSightings],
     calibrations: tuple[Calibration, Calibration],
-    offset_s: float,
+    clocks: Clocks,
 ) -> Float[np.ndarray, "A B"]:
     """Distance between the rays to the ends of each pair of tracks, over the fish's length.
 
@@ -244,7 +283,7 @@ def _apart(
     begins, ends = (np.array([other.times_ns[n] for other in others]) for n in (0, -1))
     for row, track in enumerate(first.values()):
         chosen = evenly(range(len(track.times_ns)), _FRAMES)
-        times = track.times_ns[chosen] + round(offset_s * 1e9)
+        times = np.array([clocks.second_ns(time_ns) for time_ns in track.times_ns[chosen].tolist()])
         ends_px = track.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
         rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)
         for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
@@ -274,7 +313,7 @@ def _off_plane_mm(
     for track_id, others in pairing.ids.items():
         track = first[track_id]
         for n in evenly(range(len(track.times_ns)), _FRAMES):
-            time_ns = int(track.times_ns[n]) + round(pairing.offset_s * 1e9)
+            time_ns = pairing.clocks.second_ns(int(track.times_ns[n]))
             views = (second[other].at(time_ns, calibrations[1]) for other in others)
             if (view := next((view for view in views if view is not None), None)) is not None:
                 own, other = (
@@ -314,7 +353,7 @@ def open_second(
     node = None
     if places_fish:
         node = _localize_by_two(first, recording, topics, header, setup, observer)
-        offset_ns = round(node.pairing.offset_s * 1e9)
+        offset_ns = round(node.pairing.clocks.offset_s * 1e9)
         ids = {other: first for first, others in node.pairing.ids.items() for other in others}
         camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
     assert camera is not None
@@ -367,10 +406,12 @@ def _localize_by_two(
             f"{len(tracks)} and {len(others)} with good frames. Are both calibrations of the same "
             "reference plane, with its zero and its axes?"
         )
+    drift = f"{pairing.clocks.drift:+.2%}"
+    gains = "" if drift.endswith("0.00%") else f" and gains {drift}"
     observer.notice(
         f"{len(pairing.ids)} of {len(tracks)} fish were seen by both cameras; the second clock is "
-        f"{pairing.offset_s:+.2f} s off, and the rays to a fish's ends pass {pairing.apart:.1%} of "
-        "its length apart"
+        f"{pairing.clocks.offset_s:+.2f} s off{gains}, and the rays to a fish's ends pass "
+        f"{pairing.apart:.1%} of its length apart"
     )
     if pairing.apart > _RAYS_WARN:
         observer.warn(
@@ -422,7 +463,7 @@ class LocalizeByTwo:
         others = self.pairing.ids.get(mesh.track_id, ())
         if not others or alone.reason not in _BY_ONE_CAMERA or alone.midline_mm is None:
             return [alone]
-        time_ns = mesh.timestamp_ns + round(self.pairing.offset_s * 1e9)
+        time_ns = self.pairing.clocks.second_ns(mesh.timestamp_ns)
         placed = list[LocalizedFish]()
         for second in self._seconds:
             for other in others:
