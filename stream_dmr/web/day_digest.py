@@ -83,7 +83,7 @@ def write_digest(
     fish = read_measured_fish(folder / DATABASE, span=span)
     content = _content(folder / DATABASE, span, fish, zero_ns, problems)
     content["box"]["num_fish"] = days.total()
-    recordings = _recordings(folder, span)
+    recordings = recordings_of(folder, span)
     content["recordings"] = grouped_sums([path for _, path in recordings])
     pictures, room = dict[str, bytes](), MAX_BYTES - len(pack(content, {}, signer))
     for name, picture in _pictures(fish, recordings, stop) if room > 0 else ():
@@ -172,7 +172,7 @@ def _fish_row(fish: Fish) -> list[object]:
     ]
 
 
-def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
+def recordings_of(folder: Path, span: Haul) -> list[tuple[int, Path]]:
     """The closed recordings that began in `span`: time of the first frame, ns, and path."""
     files, found = list[Path](), list[tuple[int, Path]]()
     with suppress(RecordingError):

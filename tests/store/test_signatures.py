@@ -15,9 +15,7 @@ from pathlib import Path
 import pytest
 
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.evidence import verify_signatures
 from stream_dmr.evidence.seal import SignedFiles, seal_run
-from stream_dmr.evidence.verify_signatures import _content as content_of_row
 from stream_dmr.evidence.verify_signatures import check_signatures
 from stream_dmr.files import sha256_of
 from stream_dmr.pipeline.measure_source import measure_source
@@ -32,7 +30,6 @@ from stream_dmr.store.ledger import (
 )
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import ScaleCheck, add_check
-from stream_dmr.store.schema import EVENTS
 from tests.support.batch_engine import without_workers
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
@@ -99,28 +96,6 @@ def execute(folder: Path, *statements: str) -> None:
     with closing(sqlite3.connect(folder / "lengths.db")) as database, database:
         for statement in statements:
             assert database.execute(statement).rowcount != 0 or "TABLE" in statement, statement
-
-
-def test_each_event_is_compared_once(key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with closing(LengthStore(tmp_path, FACTS, signer=Signer(key))) as store:
-        for number in range(100):
-            store.append(EVENTS, "drift", event(number), is_urgent=False)
-    compared = list[str]()
-
-    class Sum(str):
-        def __eq__(self, other: object) -> bool:
-            compared.append(self)
-            return super().__eq__(other)
-
-        __hash__ = str.__hash__
-
-    monkeypatch.setattr(verify_signatures, "_content", lambda row: Sum(content_of_row(row)))
-    assert changes(tmp_path, key) == []
-    assert len(compared) < 1500
-
-
-def event(number: int) -> dict[str, object]:
-    return {"kind": "drift", "text": f"bumped {number}", "timestamp_ns": number}
 
 
 def entries_of(folder: Path) -> list[ChainEntry]:

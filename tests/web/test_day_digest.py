@@ -323,7 +323,7 @@ def test_a_day_weeks_ago_is_found_without_reading_the_weeks_since(
     for broken in (set[int](), {*range(515, 524)}, {500, 750}):
         damaged |= broken
         opened.clear()
-        found = [path.stem[-6:] for _, path in day_digest._recordings(tmp_path, span)]
+        found = [path.stem[-6:] for _, path in day_digest.recordings_of(tmp_path, span)]
         assert found == [f"{n:06d}" for n in range(500, 524) if n not in damaged]
         assert len(opened) < 40
 
