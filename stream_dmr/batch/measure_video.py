@@ -2,12 +2,12 @@
 
 import json
 import math
+import os
 import shutil
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from stream_dmr.files import rename_durably
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import RunOptions, command_of
+from stream_dmr.recording.header import InputFile
 from stream_dmr.store.batch_folder import (
     DONE,
     FAILED,
@@ -27,7 +28,8 @@ from stream_dmr.store.batch_folder import (
     results_folder,
     unfinished_folder,
 )
-from stream_dmr.store.fish import run_notes
+from stream_dmr.store.fish import read_runs, run_notes
+from stream_dmr.store.run_facts import RunFacts
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.web.watch_observer import WatchObserver
@@ -113,14 +115,35 @@ def read_outcome(job: Job, out: Path) -> Outcome | None:
 
 
 def reviewed_outcome(job: Job, out: Path) -> Outcome | None:
-    """What a job came to by other inputs, if reviewers gave verdicts on it; None without any."""
+    """What a job came to by other inputs, if reviewers gave verdicts on it; None without any.
+
+    Raises OutputError if they gave them on another video, which would be lost or taken for this.
+    """
     folder = results_folder(job.name, out)
     outcome, database = _read_file(folder / OUTCOME), folder / DATABASE
     if outcome is None or outcome.status != DONE or not database.exists():
         return None
-    with suppress(OutputError):  # a damaged one is made again
-        return outcome if read_verdicts(database) else None
-    return None
+    try:
+        verdicts, runs = read_verdicts(database), read_runs(database).values()
+    except OutputError:  # a damaged one is made again
+        return None
+    for measured in runs if verdicts else ():
+        if not _is_still_there(job, measured, since_ns=(folder / OUTCOME).stat().st_mtime_ns):
+            raise OutputError(
+                f"{folder}: expected the results of {job.options.source}, got those of "
+                f"{measured.source_path} as it was then, with verdicts of reviewers; move the "
+                "folder away, or choose another --out"
+            )
+    return outcome if verdicts else None
+
+
+def _is_still_there(job: Job, measured: RunFacts, *, since_ns: int) -> bool:
+    """True if a job's video is the measured one, perhaps moved, or is gone from its place."""
+    video = Path(job.options.source)
+    is_same_place = os.path.abspath(video) == measured.source_path
+    if is_same_place and not (video.exists() and video.stat().st_mtime_ns > since_ns):
+        return True  # without reading all of it
+    return InputFile(path=str(video), sha256=measured.source_sha256).is_unchanged()
 
 
 def _read_file(path: Path) -> Outcome | None:

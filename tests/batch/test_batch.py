@@ -319,6 +319,16 @@ def test_a_reviewed_video_is_not_measured_again_by_other_inputs(season: Path, tm
     assert "video: its inputs or stream-dmr changed, but reviewers gave verdicts" in line
 
 
+def test_verdicts_on_one_video_are_not_taken_for_those_on_another(season: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    measure(jobs_of(season, tmp_path, row("clip")), out)
+    verdict = Verdict(track_id=2, kind="accept", reviewer="Ada")
+    add_verdict(results_folder("video", out) / "lengths.db", verdict)
+    assert measure(jobs_of(season, tmp_path, row("again")), out) == {"video": "done"}  # moved
+    with pytest.raises(OutputError, match=r"results of .*other/video.mp4, got those of .*clip/vid"):
+        measure(jobs_of(season, tmp_path, row("other")), out)
+
+
 def test_the_next_call_takes_verdicts_and_checks_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
