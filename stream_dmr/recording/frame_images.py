@@ -1,6 +1,6 @@
 """Restore the images of recorded frames."""
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -17,7 +17,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
 from stream_dmr.recording.selection import Selection
 from stream_dmr.recording.topics import KEY_FRAME_NS
-from stream_dmr.sources.folders import clips_in
+from stream_dmr.sources.folders import PictureFolder, clips_in
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.sources.video_file import SeekableVideo, VideoFile
@@ -107,14 +107,20 @@ class ClipPictures:
 
 
 @contextmanager
-def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameRestorer]:
-    """The images of a source that was recorded. Raises SourceError if it can't be read."""
+def open_pictures(
+    source: str, settings: ReadFramesSettings, *, first: int = 1
+) -> Generator[FrameRestorer]:
+    """The images of a source that was recorded, from the frame of the index `first` on.
+
+    Raises SourceError if it can't be read.
+    """
     if Path(source).is_dir() and clips_in(Path(source)):
         with closing(ClipPictures(Path(source), settings)) as pictures:
             yield pictures
     else:
         with closing(open_source(source, settings)) as frames:
-            yield SourcePictures(frames)
+            is_folder = isinstance(frames, PictureFolder)
+            yield SourcePictures(frames.since(first) if is_folder else frames)
 
 
 @contextmanager
@@ -183,17 +189,18 @@ class FrameLookup:
         """The frames from a capture time (included) to another (excluded), in order."""
         selection = Selection(time_ns=time_ns)
         recorded = RecordedPictures(self._recording, selection)
-        missing: list[tuple[Frame, bytes]] = []
+        missing, source = list[tuple[Frame, bytes]](), self._source
         for message, payload in decoded_messages(self._recording, [Frame], selection):
             assert isinstance(message, Frame)
-            found = self._of_video(message, payload)
+            found = message if missing else self._of_video(message, payload)
             if not has_original_pixels(found, payload):
                 found = recorded.restore(message, payload)
-            if found.image.size == 0 and self._source is not None:
-                missing.append((message, payload))  # a folder is read from its start
+            if source is not None and (missing or found.image.size == 0):
+                missing.append((message, payload))  # with those after it, in order
                 continue
             yield FoundFrame(frame=found, is_original=has_original_pixels(found, payload))
-        yield from self._of_source(missing)
+        if source is not None and missing:
+            yield from self._of_source(source, missing)
 
     def close(self) -> None:
         if self._video is not None:
@@ -201,24 +208,25 @@ class FrameLookup:
 
     def _of_video(self, frame: Frame, payload: bytes) -> Frame:
         """The frame with the video's picture; unchanged if that isn't the recorded picture."""
-        if self._video is None or has_original_pixels(frame, payload):
+        video = self._video
+        if video is None or has_original_pixels(frame, payload):
             return frame
-        image = self._video.image_at(frame.timestamp_ns)
+        image = video.image_at(frame.timestamp_ns)
         restored = frame if image is None else replace(frame, image=image)
-        if image is not None and not has_original_pixels(restored, payload):
-            self._video = self._source = None  # another file of the same name
-            return frame
-        return restored
+        # A search finds another picture where times repeat, as in files that were joined.
+        return restored if has_original_pixels(restored, payload) else frame
 
-    def _of_source(self, missing: list[tuple[Frame, bytes]]) -> Iterator[FoundFrame]:
+    def _of_source(
+        self, source: str, missing: Sequence[tuple[Frame, bytes]]
+    ) -> Iterator[FoundFrame]:
         """Frames that no search finds: the source is read up to them."""
-        if not missing or self._source is None:
-            return
         settings = recorded_settings(self._recording.header, "read_frames", ReadFramesSettings)
-        with open_pictures(self._source, settings) as pictures:
+        with open_pictures(source, settings, first=missing[0][0].frame_index) as pictures:
             for frame, payload in missing:
                 try:
                     found = pictures.restore(frame, payload)
-                except SourceError:  # another file of the same name
+                except SourceError:
                     found = frame
+                    if self._video is not None:  # another file of the same name
+                        self._video = self._source = None
                 yield FoundFrame(frame=found, is_original=has_original_pixels(found, payload))

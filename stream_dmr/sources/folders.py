@@ -72,7 +72,11 @@ class PictureFolder(Source):
         self._white: int | None = None  # of 16-bit pictures, known from the first one on
 
     def __iter__(self) -> Iterator[Frame]:
-        for frame_index, path in enumerate(self._paths, start=1):
+        return self.since(1)
+
+    def since(self, first: int) -> Iterator[Frame]:
+        """The frames from an index on: those before need not be decoded."""
+        for frame_index, path in enumerate(self._paths[first - 1 :], start=first):
             if self._is_closed:
                 return
             picture = self._read(path)

@@ -1,6 +1,7 @@
 """The clip around a fish: every frame with the outlines of the fish in it."""
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,19 @@ import pytest
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
-from stream_dmr.messages import FishCrop
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
+from stream_dmr.recording.reading import messages_of
+from stream_dmr.sources.folders import PictureFolder
+from stream_dmr.sources.source import ReadFramesSettings
+from stream_dmr.sources.video_file import SeekableVideo, VideoFile
 from stream_dmr.web.clip import clip_span_ns, fish_clip
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import RunReport
-from tests.support.fish_run import FISH, measure
+from tests.support.fish_run import FISH, measure, request
+from tests.support.tiny_clip import write_clip
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +97,42 @@ def test_clips_follow_each_other_without_gap_or_overlap(report: RunReport):
     assert spans[1][0] < 0 < spans[1][1]
     with pytest.raises(UserError, match="expected a fish"):
         fish_clip(report, FrameLookup(report.recording, None), 9)
+
+
+def test_a_search_that_finds_another_picture_loses_none(
+    report: RunReport, monkeypatch: pytest.MonkeyPatch
+):
+    expected = [jpeg for _, jpeg in read(report, source_of(report))]
+    search, found = SeekableVideo.image_at, list[Any]()
+
+    def repeating(video: SeekableVideo, timestamp_ns: int) -> Any:
+        found.append(search(video, timestamp_ns) if len(found) != 2 else found[0])
+        return found[-1]
+
+    monkeypatch.setattr(SeekableVideo, "image_at", repeating)
+    assert [jpeg for _, jpeg in read(report, source_of(report))] == expected
+
+
+def test_a_picture_of_a_folder_is_found_without_those_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_clip(tmp_path / "clip", fish=FISH)
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for frame in VideoFile(tmp_path / "clip" / "video.mp4", ReadFramesSettings()):
+        cv2.imwrite(str(pictures / f"{frame.frame_index:06d}.png"), frame.image)
+    given = request(tmp_path / "clip", tmp_path / "out", source=str(pictures))
+    measure_source(given, stop=threading.Event())
+    recording = open_report(tmp_path / "out", max_drawn=0).recording
+    [*_, last] = messages_of(recording, Frame)
+    opened, decode_picture = list[str](), PictureFolder._read
+
+    def noted(folder: PictureFolder, path: Path) -> Any:
+        opened.append(path.name)
+        return decode_picture(folder, path)
+
+    monkeypatch.setattr(PictureFolder, "_read", noted)
+    time_ns = (last.timestamp_ns, last.timestamp_ns + 1)
+    [found] = FrameLookup(recording, str(pictures)).frames(time_ns)
+    assert found.is_original
+    assert opened == ["000001.png", "000006.png"]  # the first one for the size
