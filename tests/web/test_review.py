@@ -359,3 +359,14 @@ def test_a_key_that_is_held_judges_one_fish(tab: Tab, out: Path):
         tab.send("Input.dispatchKeyEvent", type="keyDown", key="a", text="a", autoRepeat=is_held)
         tab.run("await settled();")
     assert [(v.kind, v.track_id) for v in read_verdicts(out / "lengths.db")] == [("accept", 1)]
+
+
+def test_the_small_picture_of_a_fish_that_was_split_is_its_new_one(tab: Tab):
+    def asked() -> int:
+        return len([url for url in tab.asked() if "thumbnail?" in url and "fish=1" in url])
+
+    tab.run("choose(1); await press('do-accept'); choose(1); await settled();")
+    before = asked()
+    assert before == 1
+    tab.run("await send({ kind: 'split', frame_index: 3 }); await settled();")
+    assert asked() == before + 1

@@ -8,13 +8,13 @@ async function detailOfServer(fish) {
 }
 
 // An image that is loaded after the others before it: drawn all at once they would hold up the clip.
-let lastThumbnail = Promise.resolve();
+let lastThumbnail = Promise.resolve(), numThumbnails = 0;
 function thumbnailOfServer(fish) {
   const image = element("img", { alt: "" });
   lastThumbnail = lastThumbnail.then(() => new Promise((done) => {
     if (!image.isConnected) { fish.image = null; return done(); }  // scrolled past
     image.onload = image.onerror = done;
-    image.src = `thumbnail?run=${fish.run}&fish=${fish.track_id}`;
+    image.src = `thumbnail?run=${fish.run}&fish=${fish.track_id}&number=${numThumbnails++}`;  // else that of before an edit
   }));
   return image;
 }
