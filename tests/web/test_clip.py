@@ -13,11 +13,12 @@ import pytest
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.pictures import read_picture
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
 from stream_dmr.recording.reading import messages_of
-from stream_dmr.sources.folders import PictureFolder
+from stream_dmr.sources import folders
 from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.sources.video_file import SeekableVideo, VideoFile
 from stream_dmr.web.clip import clip_span_ns, fish_clip
@@ -125,13 +126,13 @@ def test_a_picture_of_a_folder_is_found_without_those_before_it(
     measure_source(given, stop=threading.Event())
     recording = open_report(tmp_path / "out", max_drawn=0).recording
     [*_, last] = messages_of(recording, Frame)
-    opened, decode_picture = list[str](), PictureFolder._read
+    opened = list[str]()
 
-    def noted(folder: PictureFolder, path: Path) -> Any:
+    def noted(path: Path, flags: int) -> Any:
         opened.append(path.name)
-        return decode_picture(folder, path)
+        return read_picture(path, flags)
 
-    monkeypatch.setattr(PictureFolder, "_read", noted)
+    monkeypatch.setattr(folders, "read_picture", noted)
     time_ns = (last.timestamp_ns, last.timestamp_ns + 1)
     [found] = FrameLookup(recording, str(pictures)).frames(time_ns)
     assert found.is_original
