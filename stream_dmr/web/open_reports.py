@@ -60,10 +60,10 @@ def open_report(
     selection = Selection(tracks=last) if undrawn else EVERYTHING
     reviewed = ReviewedMessages(recording, None if as_measured else database, selection)
     drawn, is_lost = dict[int, DrawnFish](), isinstance(recording, LostRecording)
-    if source is not None and not is_lost:
-        _require_source(recording, source)
     if last and not is_lost:
         drawn = draw_fish(reviewed, recording, source)
+    elif source is not None and not is_lost:
+        _require_source(recording, source)  # which drawing does
     return RunReport(
         path=path,
         recording=recording,

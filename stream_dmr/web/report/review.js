@@ -111,7 +111,8 @@ function takeRows(rows) {
     const at = DATA.fish.findIndex((one) => one.id === row.id), old = DATA.fish[at];
     const isSame = old && ["origin", "frames_seen", "first_frame", "last_frame", "corrected_length_mm"].every((name) => old[name] === row[name]);
     if (row.gone) { if (at >= 0) DATA.fish.splice(at, 1); continue; }
-    if (isSame) Object.assign(row, { detail: old.detail, image: old.image });
+    if (isSame) row.detail = old.detail;
+    if (isSame && old.image?.src) row.image = old.image;  // one that still waits may be dropped as scrolled past
     if (at >= 0) DATA.fish[at] = row;
     else DATA.fish.push(row);
   }
