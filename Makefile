@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 setup: $(STAMP)  ## compile the numeric loops, half a minute; without it the first run does
 	$(BIN)/stream-dmr setup
 
-demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
+demo: $(STAMP)  ## the main job on the bundled scene, lengths beside the truth
 	$(BIN)/stream-dmr demo
 
 # One worker more than two cores: for a quarter of the time tests wait for others.

@@ -2,7 +2,7 @@
 
     python -m benchmarks.batch_speed --videos 4 --engines local ray [--rounds 3]
 
-Copies of the embedded scene with their masks, and all of them in one raw video; with one worker and
+Copies of the bundled scene with their masks, and all of them in one raw video; with one worker and
 with two. With more rounds it prints medians. The first video of each worker also pays for its
 start. Figures: docs/research/batch-speed.md.
 """
@@ -71,7 +71,7 @@ def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
 
 
 def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
-    """The jobs of these videos of the embedded scene, by a manifest."""
+    """The jobs of these videos of the bundled scene, by a manifest."""
     with manifest.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()

@@ -1,4 +1,4 @@
-"""Every example runs on the embedded scene, and prints lengths near the true ones."""
+"""Every example runs on the bundled scene, and prints lengths near the true ones."""
 
 import csv
 import re

@@ -1,7 +1,7 @@
-"""Commands, Python and settings of README and guide run as they stand, on the embedded scene.
+"""Commands, Python and settings of README and guide run as they stand, on the bundled scene.
 
 Each page has a folder of its own, in which its blocks run in their order. The video is the first
-seconds of the embedded scene.
+seconds of the bundled scene.
 """
 
 import re
@@ -95,7 +95,7 @@ def is_run(command: str) -> bool:
 
 
 def video(path: Path, *, after: int = 0) -> None:
-    """Frames of the embedded scene; the first ones show three fish."""
+    """Frames of the bundled scene; the first ones show three fish."""
     shown = cv2.VideoCapture(str(sd.DEMO_SCENE / "video.mp4"))
     size = (int(shown.get(cv2.CAP_PROP_FRAME_WIDTH)), int(shown.get(cv2.CAP_PROP_FRAME_HEIGHT)))
     codec = cv2.VideoWriter_fourcc(*"mp4v")
@@ -108,7 +108,7 @@ def video(path: Path, *, after: int = 0) -> None:
 
 
 def other_run(folder: Path) -> None:
-    """The results of the rest of the embedded scene."""
+    """The results of the rest of the bundled scene."""
     film = folder.with_suffix(".mp4")
     video(film, after=NUM_FRAMES)
     sd.measure(film, calibration=sd.DEMO_SCENE / "calibration.yaml", out=folder)

@@ -32,7 +32,7 @@ from stream_dmr.version import __version__
 # The commands in the order and groups of --help, each with its line there.
 _GROUPS: dict[str, dict[Callable[..., None], str]] = {
     "Measure": {
-        demo: "Measure the fish of the embedded scene.",
+        demo: "Measure the fish of the bundled scene.",
         run: "Measure the fish of a video, a folder or a camera.",
         combine: "Measure fish that two cameras saw: one length of both.",
         batch: "Measure every video of a manifest.",

@@ -67,7 +67,7 @@ def demo(
     ),
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Measure the fish of the embedded scene by their mesh, and print the true lengths beside.
+    """Measure the fish of the bundled scene by their mesh, and print the true lengths beside.
 
     Exits with 1 if a fish was not measured.
     """
