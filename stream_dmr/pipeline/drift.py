@@ -193,14 +193,20 @@ class DriftAlarms:
     """Monitors scene and fits of a run; notes alarms in the store and returns flags for lengths."""
 
     def __init__(
-        self, store: LengthStore, settings: DriftSettings, *, on_notice: Callable[[str], None]
+        self,
+        store: LengthStore,
+        settings: DriftSettings,
+        *,
+        on_alarm: Callable[[Sequence[str]], None],
+        on_notice: Callable[[str], None],
     ) -> None:
         """References come from earlier runs in the store with the same calibration.
 
         Those of the fits with the same template as well: meshes of another fit otherwise.
+        `on_alarm` gets the causes whenever they change; none at the end of an alarm.
         """
         self._store = store
-        self._on_notice = on_notice
+        self._on_alarm, self._on_notice = on_alarm, on_notice
         stored = store.scene()
         reference = None if stored is None else decode_scene(stored)
         self._scene = SceneMonitor(settings, reference=reference)
@@ -227,6 +233,7 @@ class DriftAlarms:
         if [*map(cause_of, alarms)] == [*map(cause_of, self._alarms)]:
             return
         self._alarms = alarms
+        self._on_alarm(alarms)
         text = "; ".join(alarms) or "the camera sees again what it was calibrated for"
         self._store.note("drift", text, timestamp_ns=timestamp_ns)
         self._on_notice(f"{text}; lengths are marked from now on" if alarms else text)

@@ -93,7 +93,7 @@ class MessageFlow:
         self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
         self._seen, self._observer = outputs.seen, observer
         self._kept_frames = inputs.kept_frames
-        self._writer = _result_writer(inputs, outputs, stop, on_notice=observer.warn)
+        self._writer = _result_writer(inputs, outputs, stop, observer)
         self._positions = None
         if inputs.positions is not None:
             inputs.positions.listen(observer.warn)
@@ -145,11 +145,11 @@ class MessageFlow:
 
 
 def _result_writer(
-    inputs: Inputs, outputs: Outputs, stop: threading.Event, *, on_notice: Callable[[str], None]
+    inputs: Inputs, outputs: Outputs, stop: threading.Event, observer: RunObserver
 ) -> ResultWriter:
     """The writer of a run, whose source continues after earlier runs from now on."""
     store = outputs.store
-    clips = resume_source(inputs.source, store, on_notice=on_notice)
+    clips = resume_source(inputs.source, store, on_notice=observer.warn)
     if inputs.numbers_frames_on:
         inputs.reader.number_after(store.before.frame_index)
     has_drift_alarms = inputs.is_endless and inputs.calibration is not None
@@ -160,12 +160,14 @@ def _result_writer(
         clips=clips,
         interrupted=outputs.interrupted,
         flag_at_end=partial(_flag_at_end, inputs, stop),
-        drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
+        drift=DriftAlarms(
+            store, inputs.config.drift, on_alarm=observer.alarm, on_notice=observer.warn
+        )
         if has_drift_alarms
         else None,
         sensors=inputs.config.sensors,
         hauls=outputs.hauls,
-        on_notice=on_notice,
+        on_notice=observer.warn,
     )
 
 

@@ -46,6 +46,9 @@ class RunObserver:
     def take(self, message: Message) -> None:
         """Take a message of a stage, as the next stage gets it."""
 
+    def alarm(self, causes: Sequence[str]) -> None:
+        """Take the causes for which lengths are flagged from now on; none: the alarm has ended."""
+
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage."""
 

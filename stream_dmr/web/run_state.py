@@ -4,7 +4,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -59,8 +59,8 @@ class RunState:
     """Takes every message in the chain's threads; the server reads it in its own. Thread-safe.
 
     Problems are a camera silent for `silence_s`, a frame in work for `stuck_s`, the line of
-    `scale_alarm`, after a wrong measurement of a known length, and a `store` whose file or folder
-    was moved, also while no frames come.
+    `scale_alarm`, after a wrong measurement of a known length, the causes for which lengths are
+    flagged, and a `store` whose file or folder was moved, also while no frames come.
     """
 
     source: Source
@@ -82,6 +82,7 @@ class RunState:
         self.num_fish: Counter[str] = Counter()  # finished fish, by status
         self.species: Counter[str] = Counter()  # of finished fish, by code
         self.fates: Counter[str] = Counter()
+        self.alarm: Sequence[str] = ()  # causes for which lengths are flagged now
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
         self._began_s = time.monotonic()
         self._lock = threading.Lock()
@@ -195,6 +196,7 @@ class RunState:
             problems += self.positions.problems()
         if alarm := self.scale_alarm():
             problems.append(alarm)
+        problems += self.alarm
         if self.store is not None and (lost := self.store.lost):
             self.sinks.report(self.store.path.name, lost)
         return problems + self.sinks.problems()

@@ -10,7 +10,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
@@ -212,6 +212,11 @@ class WatchObserver(RunObserver):
         if self._state is not None:
             self._state.warn(line)
         self._observer.warn(line)
+
+    def alarm(self, causes: Sequence[str]) -> None:
+        if self._state is not None:
+            self._state.alarm = causes
+        self._observer.alarm(causes)
 
     def frame_done(self) -> None:
         if self._state is not None:

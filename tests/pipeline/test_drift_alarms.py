@@ -1,6 +1,6 @@
 """Alarms of an endless run in its store: noted when they change, flags of the fish meanwhile."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -23,30 +23,35 @@ def store(tmp_path: Path) -> Iterator[LengthStore]:
         yield store
 
 
+def ignore(_: object) -> None:
+    pass
+
+
 def flags_of(alarms: DriftAlarms, ious: np.ndarray) -> list[list[str]]:
     return [alarms.take_fish(float(iou), timestamp_ns=k) for k, iou in enumerate(ious)]
 
 
 def test_worse_fish_are_flagged_and_the_change_is_noted_once(store: LengthStore):
-    rng, notices = np.random.default_rng(1), list[str]()
-    alarms = DriftAlarms(store, SETTINGS, on_notice=notices.append)
+    rng, notices, causes = np.random.default_rng(1), list[str](), list[Sequence[str]]()
+    alarms = DriftAlarms(store, SETTINGS, on_alarm=causes.append, on_notice=notices.append)
     assert not any(flags_of(alarms, rng.normal(0.93, 0.01, 20)))
     flags = flags_of(alarms, rng.normal(0.85, 0.01, 30))
     assert flags[-1] == flags[-2] != []
     assert len(notices) == 1
     assert flags_of(alarms, rng.normal(0.93, 0.01, 30))[-1] == []
     assert len(notices) == 2
+    assert causes == [tuple(flags[-1]), ()]
 
 
 def test_a_fish_without_an_iou_changes_nothing(store: LengthStore):
-    alarms = DriftAlarms(store, SETTINGS, on_notice=lambda line: None)
+    alarms = DriftAlarms(store, SETTINGS, on_alarm=ignore, on_notice=ignore)
     assert alarms.take_fish(None, timestamp_ns=1) == []
 
 
 def test_the_fish_of_earlier_runs_are_the_reference(store: LengthStore):
     for track_id in range(1, 21):
         store.add(fish(track_id), iou=0.93 + 0.001 * (track_id % 3))
-    alarms = DriftAlarms(store, SETTINGS, on_notice=lambda line: None)
+    alarms = DriftAlarms(store, SETTINGS, on_alarm=ignore, on_notice=ignore)
     assert flags_of(alarms, np.full(10, 0.85))[-1] != []
 
 
@@ -55,18 +60,18 @@ def test_the_fish_of_another_template_are_no_reference(store: LengthStore, tmp_p
         store.add(fish(track_id), iou=0.93 + 0.001 * (track_id % 3))
     store.close()
     with closing(LengthStore(tmp_path, replace(FACTS, template_sha256="another"))) as later:
-        alarms = DriftAlarms(later, SETTINGS, on_notice=lambda line: None)
+        alarms = DriftAlarms(later, SETTINGS, on_alarm=ignore, on_notice=ignore)
         assert not any(flags_of(alarms, np.full(40, 0.85)))
 
 
 def test_the_first_static_scene_of_a_calibration_is_kept(store: LengthStore):
     picture = np.random.default_rng(2).integers(0, 255, (60, 80, 3)).astype(np.uint8)
-    alarms = DriftAlarms(store, DriftSettings(sample_s=1.0), on_notice=lambda line: None)
+    alarms = DriftAlarms(store, DriftSettings(sample_s=1.0), on_alarm=ignore, on_notice=ignore)
     assert store.scene() is None
     for k in range(40):
         frame = Frame(frame_index=k + 1, timestamp_ns=k * 10**9, image=picture, source="camera")
         alarms.take_frame(frame)
     kept = store.scene()
     assert kept is not None
-    DriftAlarms(store, SETTINGS, on_notice=lambda line: None).take_frame(frame)
+    DriftAlarms(store, SETTINGS, on_alarm=ignore, on_notice=ignore).take_frame(frame)
     assert store.scene() == kept

@@ -185,6 +185,15 @@ def test_a_known_length_that_is_measured_wrong_is_a_problem(tmp_path: Path, stat
         assert watched.problems() == []
 
 
+def test_lengths_that_are_flagged_are_a_problem(server: WatchServer, state: RunState):
+    bumped = "the camera seems bumped (the rail is 12 px off)"
+    state.alarm = (bumped,)
+    code, _, content = get(f"{server.address}health")
+    assert (code, json.loads(content)["problems"]) == (503, [bumped])
+    state.alarm = ()
+    assert get(f"{server.address}health")[0] == 200
+
+
 def test_health_knows_every_output(server: WatchServer, state: RunState):
     state.sinks.report("frames.csv")
     state.sinks.report("recording-*.mcap", "no such folder")
