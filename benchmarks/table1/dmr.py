@@ -9,8 +9,9 @@ from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
 from stream_dmr.pipeline.chain import Node
-from stream_dmr.pipeline.combine import LocalizeByTwo, Pairing, tracks_of
+from stream_dmr.pipeline.combine import LocalizeByTwo
 from stream_dmr.pipeline.config import Config, by_two_cameras
+from stream_dmr.pipeline.pair_fish import Pairing, tracks_of
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.template.template import Template
 

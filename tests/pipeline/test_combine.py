@@ -16,7 +16,8 @@ from stream_dmr.geometry import box_iou
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.localization.two_views import second_from_first
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.pipeline.combine import FishSightings, LocalizeByTwo, pair_up, tracks_of
+from stream_dmr.pipeline.combine import LocalizeByTwo
+from stream_dmr.pipeline.pair_fish import FishSightings, pair_up, tracks_of
 from stream_dmr.pipeline.replay_recording import replay
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.reasons import Reason
