@@ -73,14 +73,11 @@ from stream_dmr.store.schema import (
 )
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import (
-    NOT_REVIEWED,
     Verdict,
-    blind_readings,
     frames_sha256,
     read_added_frames,
     read_verdicts,
-    reviews_of,
-    standing,
+    reviews_after,
 )
 from stream_dmr.tables import rotated_files
 
@@ -138,12 +135,9 @@ def _corrections(
         if (fit.track_id, fit.frame_index) in wanted
     }
     first_ns = _first_left_ns(database, recording)
-    for number, verdict in corrections:
-        said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
-        of_reader = blind_readings(said).get(verdict.reviewer, [])
-        counted = standing(said) if verdict.reading is None else of_reader
-        of_fish = [other for other in counted if other.track_id == verdict.track_id]
-        review = reviews_of(of_fish).get(verdict.track_id, NOT_REVIEWED)
+    reviews = reviews_after(verdicts, [number for number, _ in corrections])
+    for (number, verdict), review in zip(corrections, reviews, strict=True):
+        name = f"verdict {number}: fish {verdict.track_id}"
         moved = {**review.moved, **verdict.moved}
         missing = [frame for frame in moved if (verdict.track_id, frame) not in fits]
         times = [fits[verdict.track_id, frame].timestamp_ns for frame in moved.keys() - {*missing}]

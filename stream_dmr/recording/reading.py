@@ -2,12 +2,12 @@
 
 import tomllib
 from bisect import bisect_right
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import chain, groupby, pairwise
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.files import natural_order
@@ -276,5 +276,10 @@ Table = TypeVar("Table", bound=Settings)
 
 def recorded_settings(header: RunHeader, table: str, kind: type[Table]) -> Table:
     """The table `[table]` of the run's config.toml; defaults if an older run had none."""
-    config = tomllib.loads(header.config_toml)
-    return kind.model_validate(config.get(table, {}))
+    return kind.model_validate(_tables(header.config_toml).get(table, {}))
+
+
+@lru_cache(8)
+def _tables(config_toml: str) -> Mapping[str, Any]:
+    """Parsed once: each corrected length asks for them."""
+    return tomllib.loads(config_toml)

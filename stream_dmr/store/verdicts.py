@@ -8,7 +8,8 @@ no review: it is only compared with it.
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
@@ -226,6 +227,30 @@ def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
                 named = replace(verdict, kind="species", species=before.species)
                 reviews[other] = remaining.after(named)
     return reviews
+
+
+def reviews_after(verdicts: Sequence[Verdict], numbers: Iterable[int]) -> Iterator[Review]:
+    """The review of a verdict's fish right after it, for each of these numbers, from 1.
+
+    After a blind reader's verdict it is that reader's.
+    """
+    of_fish = defaultdict[int, list[tuple[int, Verdict]]](list)
+    undone_by = dict[int, int]()  # by number of a verdict, that of the first which takes it back
+    for number, verdict in enumerate(verdicts, start=1):
+        of_fish[verdict.track_id].append((number, verdict))
+        if verdict.undoes is not None:
+            undone_by.setdefault(verdict.undoes, number)
+    for number in numbers:
+        last = verdicts[number - 1]
+        said = [
+            replace(verdict, reading=None)
+            for n, verdict in of_fish[last.track_id]
+            if n <= number < undone_by.get(n, number + 1)
+            and verdict.kind != "undo"
+            and verdict.reading == last.reading
+            and (last.reading is None or verdict.reviewer == last.reviewer)
+        ]
+        yield reviews_of(said).get(last.track_id, NOT_REVIEWED)
 
 
 # Fields of a verdict that stand in no checksum if they are None: older databases lack them.

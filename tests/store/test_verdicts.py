@@ -26,7 +26,9 @@ from stream_dmr.store.verdicts import (
     next_track_id,
     read_added_frames,
     read_verdicts,
+    reviews_after,
     reviews_of,
+    standing,
     verdict_line,
 )
 from tests.support.final_estimates import FACTS
@@ -42,6 +44,18 @@ duplicates = st.builds(
     kind=st.just("duplicate"),
     duplicate_of=st.integers(1, 4),
     reviewer=st.just("Ada"),
+)
+
+verdicts = st.builds(
+    Verdict,
+    track_id=st.integers(1, 3),
+    kind=st.sampled_from(["correct", "correct", "accept", "withdraw", "undo"]),
+    reviewer=st.sampled_from(["Ada", "Bob"]),
+    reading=st.sampled_from([None, BLIND]),
+    frame_index=st.integers(1, 3),
+    **dict.fromkeys(("head_u", "head_v", "tail_u", "tail_v"), st.just(1.0)),
+    length_mm=st.floats(1, 9),
+    undoes=st.none() | st.integers(1, 9),
 )
 
 
@@ -193,3 +207,28 @@ def test_a_species_that_was_named_goes_on_with_a_merged_fish():
     assert reviews_of([named, merged, own])[2].species == "HAD"
     undone = Verdict(track_id=1, kind="undo", undoes=2, reviewer="Bob")
     assert 2 not in reviews_of([named, merged, undone])
+
+
+@given(st.lists(verdicts, max_size=12))
+def test_the_review_after_a_verdict_is_that_of_all_verdicts_until_then(log: list[Verdict]):
+    log = [v if v.kind == "undo" else replace(v, undoes=None) for v in log]
+    numbers = [n for n, verdict in enumerate(log, start=1) if verdict.kind == "correct"]
+    for number, review in zip(numbers, reviews_after(log, numbers), strict=True):
+        said, last = log[:number], log[number - 1]
+        blind = blind_readings(said).get(last.reviewer, [])
+        expected = reviews_of(standing(said) if last.reading is None else blind)
+        assert review == expected.get(last.track_id, NOT_REVIEWED)
+
+
+def test_the_review_after_a_verdict_looks_at_no_other_fish(monkeypatch: pytest.MonkeyPatch):
+    fish = range(1, 301)
+    log = [replace(ACCEPT, track_id=n, kind="correct", frame_index=1) for n in (*fish, *fish)]
+    looked, after = list[int](), Review.after
+
+    def looking(review: Review, verdict: Verdict) -> Review:
+        looked.append(verdict.track_id)
+        return after(review, verdict)
+
+    monkeypatch.setattr(Review, "after", looking)
+    assert len([*reviews_after(log, range(1, len(log) + 1))]) == len(log)
+    assert len(looked) == 900
