@@ -5,7 +5,7 @@ import sys
 from base64 import b64encode
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
 from statistics import mean
@@ -178,6 +178,7 @@ def render_page(
     """
     template = reports[0].recording.header.template
     placed = place(reports)
+    facts = {fish.run_id: fish.facts for report in reports for fish in report.fish}
     about = {
         "title": title,
         "began_s": min(part.report.span_s[0] + part.shift_s for part in placed),
@@ -185,7 +186,7 @@ def render_page(
         "template": template.name,
         "faces": _packed(template.faces.astype("<u4")),
         "fisheries": reports[0].settings.model_dump(),
-        "runs": {fish.run_id: asdict(fish.facts) for report in reports for fish in report.fish},
+        "runs": {run_id: asdict(of_run) for run_id, of_run in facts.items()},
         "notes": [
             *notes,
             *(line for report in reports for line in (*report.notes, *report.recording.warnings)),
@@ -273,7 +274,7 @@ def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: its row of fish.csv, and what the page shows besides."""
     template = template_of_fish(report.recording, fish)
     record = fish_record(fish, template, report.settings)
-    of_run = asdict(fish.facts)
+    of_run = {field.name for field in fields(fish.facts)}
     row = {name: value for name, value in record.items() if name not in of_run}
     return row | {
         "id": fish.estimate.track_id,  # in the page

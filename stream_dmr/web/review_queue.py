@@ -55,10 +55,8 @@ class ReviewQueue:
 
     def page(self, title: str) -> str:
         reports = [
-            replace(
-                recorder.report, fish=[fish for fish, row in self._fish(run) if self._is_shown(row)]
-            )
-            for run, recorder in enumerate(self._recorders)
+            replace(report, fish=[fish for fish in self._fish(run) if self._is_shown(run, fish)])
+            for run, report in enumerate(recorder.report for recorder in self._recorders)
         ]
         return render_page(reports, title=title, review=self._about | {"undo": self._undo()[1]})
 
@@ -89,7 +87,7 @@ class ReviewQueue:
 
     def detail(self, run: int, track_id: int) -> dict[str, Any]:
         """The details that a row opens. UserError without such a fish."""
-        for fish, _ in self._fish(run, {track_id}):
+        for fish in self._fish(run, {track_id}):
             return fish_detail(fish, self._recorder(run).report)
         raise UserError(f"expected a fish of this review, got {track_id}")
 
@@ -125,27 +123,25 @@ class ReviewQueue:
         return f"Fish {last.track_id}{video}: {last.in_words}" if last else ""
 
     def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
-        rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
-        placed = self.placed[run]
-        lost = [track_id for track_id in track_ids if track_id not in rows]
-        gone = [{"id": placed.row_id(track_id), "gone": True} for track_id in lost]
-        return [*(row for row in rows.values() if self._is_shown(row)), *gone]
-
-    def _fish(
-        self, run: int, wanted: set[int] | None = None
-    ) -> Iterator[tuple[Fish, dict[str, Any]]]:
-        """The fish of a run as this reader sees them, with their rows."""
-        report, reviews, _ = self._recorder(run).snapshot()
+        report, _, _ = self._recorder(run).snapshot()
         placed = replace(self.placed[run], report=report)
+        fish = {seen.estimate.track_id: seen for seen in self._fish(run, set(track_ids))}
+        lost = [track_id for track_id in track_ids if track_id not in fish]
+        gone = [{"id": placed.row_id(track_id), "gone": True} for track_id in lost]
+        return [*(placed.row(f) for f in fish.values() if self._is_shown(run, f)), *gone]
+
+    def _fish(self, run: int, wanted: set[int] | None = None) -> Iterator[Fish]:
+        """The fish of a run as this reader sees them."""
+        report, reviews, _ = self._recorder(run).snapshot()
         for fish in report.fish:
             track_id = fish.estimate.track_id
             if wanted is None or track_id in wanted:
-                seen = replace(fish, review=reviews.get(track_id, NOT_REVIEWED))
-                yield seen, placed.row(seen)
+                yield replace(fish, review=reviews.get(track_id, NOT_REVIEWED))
 
-    def _is_shown(self, row: dict[str, Any]) -> bool:
+    def _is_shown(self, run: int, fish: Fish) -> bool:
         """True for the fish of the sample, and for fish added after it was drawn."""
-        return self._chosen is None or row["id"] in self._chosen or row["id"] not in self._measured
+        number = self.placed[run].row_id(fish.estimate.track_id)
+        return self._chosen is None or number in self._chosen or number not in self._measured
 
 
 def species_choices(own_list: str) -> list[dict[str, str]]:

@@ -5,6 +5,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import asdict
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.codec import decode
 from stream_dmr.store.edits import corrected_fish, corrected_length
-from stream_dmr.store.fish import read_stored_fish
+from stream_dmr.store.fish import Fish, read_stored_fish
 from stream_dmr.store.verdicts import read_verdicts
+from stream_dmr.web import report_page
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import RunReport, render_page
 from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
@@ -36,6 +38,26 @@ def report(out: Path) -> RunReport:
 @pytest.fixture
 def judge(report: RunReport) -> ReviewQueue:
     return ReviewQueue([report], reviewer="Ada")
+
+
+def test_a_page_makes_each_row_once_and_tells_of_a_run_once(
+    judge: ReviewQueue, monkeypatch: pytest.MonkeyPatch
+):
+    made, told, row = list[int](), list[object](), report_page.summary_row
+
+    def counting(fish: Fish, of_report: RunReport) -> dict[str, Any]:
+        made.append(fish.estimate.track_id)
+        return row(fish, of_report)
+
+    def telling(facts: Any) -> dict[str, Any]:
+        told.append(facts)
+        return asdict(facts)
+
+    monkeypatch.setattr(report_page, "summary_row", counting)
+    monkeypatch.setattr(report_page, "asdict", telling)
+    judge.page("x")
+    assert len(made) == len({*made}) > 1
+    assert len(told) == 1
 
 
 def submit(judge: ReviewQueue, **said: Any) -> dict[str, Any]:
