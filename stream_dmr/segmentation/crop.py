@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated
 
 import cv2
@@ -30,7 +29,13 @@ from stream_dmr.segmentation.crop_geometry import (
     visible_bbox,
 )
 from stream_dmr.segmentation.end_judge import missing_end
-from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter, resize, segment_both_ways
+from stream_dmr.segmentation.segmenter import (
+    SegmentedFish,
+    Segmenter,
+    resize,
+    segment_both_ways,
+    segment_upright_as_well,
+)
 from stream_dmr.settings import Settings
 
 _PictureSize = Annotated[int, Field(ge=64, le=1024, multiple_of=SIZE_MULTIPLE_PX)]
@@ -269,13 +274,13 @@ def _look(
     """The finest picture of a crop, with its ends, and the mean probability of all its pictures."""
     width, sizes_px = crop_camera.width, view.settings.segmenter_sizes_px
     side_px = width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
-    segment = partial(segment_both_ways, segmenter) if len(sizes_px) > 1 else segmenter.segment
+    segment = segment_both_ways if len(sizes_px) > 1 else segment_upright_as_well
     pictures, looks = [], list[SegmentedFish]()
     for size_px in picture_sizes(side_px, sizes_px):
         cameras = {"crop_camera": crop_camera.resized(size_px), "frame_camera": view.camera}
         pictures += resample([Layer(view.image)], **cameras)
         box = box_in_crop(bbox_xyxy_px, **cameras)
-        looks.append(segment(pictures[-1], box).resized(width))
+        looks.append(segment(segmenter, pictures[-1], box).resized(width))
     probability = np.mean([look.probability for look in looks], axis=0)
     return resize(pictures[-1], width), probability, looks[-1].ends
 

@@ -69,3 +69,34 @@ def segment_both_ways(
     box = np.array([len(image) - x1, y0, len(image) - x0, y1])
     mirrored = segmenter.segment(np.ascontiguousarray(image[:, ::-1]), box)
     return replace(found, probability=(found.probability + mirrored.probability[:, ::-1]) / 2)
+
+
+_QUARTER = np.array([[0, 1], [-1, 0]])  # turns x, y as np.rot90 turns a picture
+
+
+def segment_upright_as_well(
+    segmenter: Segmenter, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+) -> SegmentedFish:
+    """The fish in a box; if its head is not up, only what is fish with the head up as well.
+
+    A network that learnt lines above fish takes a line to any other side for a part of them, as in
+    the pictures of a turned camera (docs/research/raw-video.md).
+    """
+    found = segmenter.segment(image, bbox_xyxy_px)
+    if found.ends is None:
+        return found
+    head_xy = found.ends.head_px - found.ends.tail_px
+    turns = [np.linalg.matrix_power(_QUARTER, number) for number in range(4)]
+    number = int(np.argmin([(turn @ head_xy)[1] for turn in turns]))
+    if number == 0:
+        return found
+    turn, size = turns[number], len(image)
+    corners = (bbox_xyxy_px.reshape(2, 2) - size / 2) @ turn.T + size / 2
+    box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+    upright = segmenter.segment(np.ascontiguousarray(np.rot90(image, number)), box)
+    probability = np.minimum(found.probability, np.rot90(upright.probability, -number))
+    ends, middle = upright.ends, (size - 1) / 2
+    if ends is not None:
+        head_px, tail_px = ((p - middle) @ turn + middle for p in (ends.head_px, ends.tail_px))
+        ends = replace(ends, head_px=head_px, tail_px=tail_px)
+    return SegmentedFish(probability=probability, ends=ends)
