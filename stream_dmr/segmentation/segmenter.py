@@ -77,7 +77,7 @@ _QUARTER = np.array([[0, 1], [-1, 0]])  # turns x, y as np.rot90 turns a picture
 def segment_upright_as_well(
     segmenter: Segmenter, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
 ) -> SegmentedFish:
-    """The fish in a box; if its head is not up, only what is fish with the head up as well.
+    """The fish in a box; if its head is not up, without what is no fish with the head up.
 
     A network that learnt lines above fish takes a line to any other side for a part of them, as in
     the pictures of a turned camera (docs/research/raw-video.md).
@@ -94,7 +94,8 @@ def segment_upright_as_well(
     corners = (bbox_xyxy_px.reshape(2, 2) - size / 2) @ turn.T + size / 2
     box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
     upright = segmenter.segment(np.ascontiguousarray(np.rot90(image, number)), box)
-    probability = np.minimum(found.probability, np.rot90(upright.probability, -number))
+    other = np.rot90(upright.probability, -number)
+    probability = np.where(other < 0.5, np.minimum(found.probability, other), found.probability)
     ends, middle = upright.ends, (size - 1) / 2
     if ends is not None:
         head_px, tail_px = ((p - middle) @ turn + middle for p in (ends.head_px, ends.tail_px))
