@@ -8,7 +8,7 @@ from threading import Lock
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int16, UInt8
 
 from stream_dmr.errors import SourceError
 from stream_dmr.files import open_file
@@ -30,6 +30,11 @@ _NEAR_END = 3  # frames; at a variable rate the last frame may stand for longer
 _MAX_BACK_NS = 1_000_000_000  # chosen: rounding and reordered pictures step back by less
 _MATROSKA = b"\x1a\x45\xdf\xa3"  # and WebM
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
+# Chosen: pictures without combs, also of ripples, foam or gravel, stay far below.
+_COMB_EVERY, _COMBED_PICTURES = 10, 5  # of the pictures looked at, so many must be combed
+_COMB_STEP = 12  # grey levels from a line to the next
+_MIN_COMBED = 1e-3  # of a picture's pixels
+_COMBED_RATIO = 5.0  # of stripes that lie to stripes that stand: in fine texture it is near 1
 
 
 class VideoFile(Source):
@@ -43,6 +48,7 @@ class VideoFile(Source):
         self._timeout_s = settings.silence_s
         self._is_closed = False
         self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
+        self._num_combed = 0
         self._later_ns = 0  # added to the times of the container since its clock went back
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
@@ -83,6 +89,8 @@ class VideoFile(Source):
             frame_index += 1
             if self._decoder.num_errors and not self._first_error:
                 self._first_error = frame_index
+            if frame_index % _COMB_EVERY == 0 and self._num_combed < _COMBED_PICTURES:
+                self._note_combs(pending.image)
             timestamp_ns = self._time_ns(pending, frame_index, previous_ns=timestamp_ns)
             yield Frame(
                 frame_index=frame_index,
@@ -134,6 +142,18 @@ class VideoFile(Source):
                 "file seems damaged, and pictures there are made up in part"
             )
 
+    def _note_combs(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Warn once of interlaced pictures: a fish that moves along itself looks longer in them."""
+        grey = image[..., 1].astype(np.int16)
+        lying = _striped(grey[:, ::4])
+        self._num_combed += lying > _MIN_COMBED + _COMBED_RATIO * _striped(grey[::4].T)
+        if self._num_combed == _COMBED_PICTURES:
+            self._on_notice(
+                f"{self.name}: its pictures seem interlaced (every second line is of another "
+                "moment), so that moving fish look too long; deinterlace the film and measure "
+                "that, e.g. ffmpeg -i OLD -vf bwdif=0 NEW"
+            )
+
     def _read(self, *, after: int) -> DecodedPicture | None:
         """The next picture; None at the end, also with a warning if the decoder fails."""
         try:
@@ -168,6 +188,14 @@ class VideoFile(Source):
                 f"{self.name}: the file promises {self.num_frames} frames, only {num_read} could "
                 "be read; it seems cut off or damaged"
             )
+
+
+def _striped(grey: Int16[np.ndarray, "H W"]) -> float:
+    """Fraction of the pixels from which a column goes up and down in turns for four lines."""
+    steps = np.diff(grey, axis=0)
+    up, down = steps > _COMB_STEP, steps < -_COMB_STEP
+    turns = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
+    return float(np.count_nonzero(turns[2:] & turns[1:-1] & turns[:-2])) / grey.size
 
 
 def _is_time(milliseconds: float) -> bool:

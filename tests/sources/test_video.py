@@ -38,6 +38,28 @@ def write_video(path, *, codec="MJPG", fps=25.0, num_frames=12, size=(64, 48)):
     return path
 
 
+@pytest.mark.parametrize("lines", ["of one moment", "of two moments", "of gravel"])
+def test_interlaced_pictures_are_named(tmp_path, lines):
+    writer = cv2.VideoWriter(
+        str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 15.0, (320, 240)
+    )
+    gravel = cv2.resize(noise(1, size=(320, 240)), (320, 240))
+    for k in range(60):
+        image = gravel.copy() if lines == "of gravel" else np.full((240, 320, 3), 60, np.uint8)
+        earlier = image.copy()
+        cv2.ellipse(image, (160, 180 - k), (14, 40), 20, 0, 360, (170, 170, 170), -1)
+        cv2.ellipse(earlier, (166, 188 - k), (14, 40), 20, 0, 360, (170, 170, 170), -1)
+        if lines == "of two moments":
+            image[1::2] = earlier[1::2]
+        writer.write(image)
+    writer.release()
+    film = VideoFile(tmp_path / "film.avi", SETTINGS)
+    list(film)
+    assert [("interlaced" in line) for line in film.warnings] == [True] * (
+        lines == "of two moments"
+    )
+
+
 def cut(path, fraction=0.5):
     data = path.read_bytes()
     short = path.with_stem(path.stem + "_cut")
