@@ -30,6 +30,7 @@ _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 # once and its speed is unknown.
 _MAX_DEVIATIONS = 3.0
 _MIN_GATE, _MAX_GATE, _FIRST_GATE = 0.3, 0.7, 1.2
+_NEXT_GATE = 0.4  # least one in the next frame: a line that comes into the box, or a gaff, moves it
 _SPEED_CHANGE = 0.2  # of the way that a lost fish is predicted to have gone
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
 _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
@@ -210,7 +211,8 @@ class Track:
             return _FIRST_GATE
         if self.snapshot is not None:
             return _MAX_GATE
-        return float(np.clip(_MAX_DEVIATIONS * np.sqrt(self._mean_square), _MIN_GATE, _MAX_GATE))
+        least = _NEXT_GATE if self.lost_frames <= 1 else _MIN_GATE
+        return float(np.clip(_MAX_DEVIATIONS * np.sqrt(self._mean_square), least, _MAX_GATE))
 
     def _cost_of_colours(self, observation: Observation) -> float:
         passed = max(1, self.frame_index - self._colours_frame)

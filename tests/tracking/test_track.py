@@ -47,14 +47,18 @@ def test_the_cost_grows_with_distance_up_to_the_gate():
 
 
 @pytest.mark.parametrize(("jitter", "is_possible"), [(0, False), (10, True)])
-def test_what_is_farther_off_than_a_fish_ever_was_is_another_one(jitter: int, is_possible: bool):
+@pytest.mark.parametrize(("later", "farthest"), [(1, 0.4), (3, 0.3)])
+def test_what_is_farther_off_than_a_fish_ever_was_is_another_one(
+    jitter: int, is_possible: bool, later: int, farthest: float
+):
     rng = np.random.default_rng(5)
     places = np.array([300, 240]) + rng.normal(0, jitter, (20, 2))
     track = followed([(float(x), float(y)) for x, y in places])
-    track.predict(21)
+    track.predict(20 + later)
     x, y = track.center
-    assert (track.cost(observe(x + 22, y)) < IMPOSSIBLE) is is_possible  # 0.37 sizes
-    assert track.cost(observe(x + 17, y)) < IMPOSSIBLE
+    beyond, within = ((farthest + share) * track.size for share in (0.05, -0.05))
+    assert (track.cost(observe(x + beyond, y)) < IMPOSSIBLE) is is_possible
+    assert track.cost(observe(x + within, y)) < IMPOSSIBLE
 
 
 def test_an_area_cut_by_the_border_is_no_evidence_against_a_fish():

@@ -229,7 +229,7 @@ def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
     assert ids(follow(frames))[-1] == [2]
 
 
-@given(st.floats(0, 2 * np.pi), st.integers(0, 6))
+@given(st.floats(0, 2 * np.pi), st.integers(1, 6))
 @settings(max_examples=20, deadline=None)
 def test_a_fish_that_appears_where_another_vanished_in_the_open_is_a_new_one(
     angle: float, gap: int
