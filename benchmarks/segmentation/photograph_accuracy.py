@@ -73,7 +73,7 @@ def judge(
     ious, claims, found = [], [], []
     for image, truth, box in crops:
         whole = len(image)
-        segment = partial(segment_both_ways, network) if len(sizes) > 1 else network.segment
+        segment = partial(segment_both_ways, network.segment) if len(sizes) > 1 else network.segment
         looks = [
             segment(resize(image, px), box * px / whole).resized(whole).probability
             for px in picture_sizes(whole, sizes)

@@ -338,6 +338,7 @@ _NO_HIDDEN_SLANT: dict[str, Any] = {"std_factor": 1.0, "max_std_ratio": 0.2, "up
 # or two, so they bend within the plane and hardly out of it; they are as far off it as the plane
 # was measured wrongly. Misfit comes from their fins, not from bends that nobody sees.
 _LYING: dict[str, dict[str, Any]] = {
+    "crop_fish": {"upright_look": False},  # they hang from no line
     "fit_mesh": {
         "hang": "plane",
         "tilt_std_rad": 0.02,

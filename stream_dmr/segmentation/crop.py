@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import cv2
@@ -68,6 +69,11 @@ class CropFishSettings(Settings):
         description="true: what was found is cut out again as a wider view shows it, and by a box "
         "that goes on beyond its ends: a detector's box may lack the tail; and a network judges "
         "whether the mask has both ends. Stills: true",
+    )
+    upright_look: bool = Field(
+        default=True,
+        description="a fish whose head is not up in the picture is looked at once more, turned, so "
+        "that a line to another side than up is not taken for a part of it; lying fish: false",
     )
     segmenter: str = Field(
         default="unet",
@@ -274,13 +280,17 @@ def _look(
     """The finest picture of a crop, with its ends, and the mean probability of all its pictures."""
     width, sizes_px = crop_camera.width, view.settings.segmenter_sizes_px
     side_px = width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
-    segment = segment_both_ways if len(sizes_px) > 1 else segment_upright_as_well
+    segment = segmenter.segment
+    if view.settings.upright_look:
+        segment = partial(segment_upright_as_well, segment)
+    if len(sizes_px) > 1:
+        segment = partial(segment_both_ways, segment)
     pictures, looks = [], list[SegmentedFish]()
     for size_px in picture_sizes(side_px, sizes_px):
         cameras = {"crop_camera": crop_camera.resized(size_px), "frame_camera": view.camera}
         pictures += resample([Layer(view.image)], **cameras)
         box = box_in_crop(bbox_xyxy_px, **cameras)
-        looks.append(segment(segmenter, pictures[-1], box).resized(width))
+        looks.append(segment(pictures[-1], box).resized(width))
     probability = np.mean([look.probability for look in looks], axis=0)
     return resize(pictures[-1], width), probability, looks[-1].ends
 

@@ -4,6 +4,7 @@ A segmenter sees a picture of the crop, not the frame. A crop is free of lens di
 pixel map to the frame is in one place (`crop_geometry`), so that a segmenter needs no camera.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -56,33 +57,20 @@ class Segmenter(Protocol):
         ...
 
 
-def segment_both_ways(
-    segmenter: Segmenter, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
-) -> SegmentedFish:
-    """The fish in a box, with the mean probability of the image and of the mirrored one.
-
-    Mirrored images are segmented a little differently, so the mean is better
-    (docs/research/real-pictures.md).
-    """
-    found = segmenter.segment(image, bbox_xyxy_px)
-    x0, y0, x1, y1 = bbox_xyxy_px
-    box = np.array([len(image) - x1, y0, len(image) - x0, y1])
-    mirrored = segmenter.segment(np.ascontiguousarray(image[:, ::-1]), box)
-    return replace(found, probability=(found.probability + mirrored.probability[:, ::-1]) / 2)
-
-
+# The fish in a box, half-open in pixels of a crop (BGR).
+Segment = Callable[[UInt8[np.ndarray, "S S 3"], Float[np.ndarray, "4"]], SegmentedFish]
 _QUARTER = np.array([[0, 1], [-1, 0]])  # turns x, y as np.rot90 turns a picture
 
 
 def segment_upright_as_well(
-    segmenter: Segmenter, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+    segment: Segment, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
 ) -> SegmentedFish:
     """The fish in a box; if its head is not up, without what is no fish with the head up.
 
     A network that learnt lines above fish takes a line to any other side for a part of them, as in
     the pictures of a turned camera (docs/research/raw-video.md).
     """
-    found = segmenter.segment(image, bbox_xyxy_px)
+    found = segment(image, bbox_xyxy_px)
     if found.ends is None:
         return found
     head_xy = found.ends.head_px - found.ends.tail_px
@@ -93,7 +81,7 @@ def segment_upright_as_well(
     turn, size = turns[number], len(image)
     corners = (bbox_xyxy_px.reshape(2, 2) - size / 2) @ turn.T + size / 2
     box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-    upright = segmenter.segment(np.ascontiguousarray(np.rot90(image, number)), box)
+    upright = segment(np.ascontiguousarray(np.rot90(image, number)), box)
     other = np.rot90(upright.probability, -number)
     probability = np.where(other < 0.5, np.minimum(found.probability, other), found.probability)
     ends, middle = upright.ends, (size - 1) / 2
@@ -101,3 +89,18 @@ def segment_upright_as_well(
         head_px, tail_px = ((p - middle) @ turn + middle for p in (ends.head_px, ends.tail_px))
         ends = replace(ends, head_px=head_px, tail_px=tail_px)
     return SegmentedFish(probability=probability, ends=ends)
+
+
+def segment_both_ways(
+    segment: Segment, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+) -> SegmentedFish:
+    """The fish in a box, with the mean probability of the image and of the mirrored one.
+
+    Mirrored images are segmented a little differently, so the mean is better
+    (docs/research/real-pictures.md).
+    """
+    found = segment(image, bbox_xyxy_px)
+    x0, y0, x1, y1 = bbox_xyxy_px
+    box = np.array([len(image) - x1, y0, len(image) - x0, y1])
+    mirrored = segment(np.ascontiguousarray(image[:, ::-1]), box)
+    return replace(found, probability=(found.probability + mirrored.probability[:, ::-1]) / 2)

@@ -58,7 +58,7 @@ def test_in_a_turned_picture_the_line_is_no_fish(turns, network, hanging):
     for _ in range(turns):
         box = np.array([box[1], side - box[2], box[3], side - box[0]])
     truth = np.rot90(truth, turns)
-    found = segment_upright_as_well(network, picture, box * scale).resized(side)
+    found = segment_upright_as_well(network.segment, picture, box * scale).resized(side)
     plain = network.segment(picture, box * scale).resized(side)
     mask, more = found.probability > 0.5, plain.probability > 0.5
     assert (mask & truth).sum() > 0.9 * (mask | truth).sum()
