@@ -230,6 +230,7 @@ class ClipFolder(Source):
         self._on_pause: Callable[[], None] = lambda: None
         self._clip_s = 0.0  # duration of the last clip
         self._video: VideoFile | None = None
+        self._is_interlaced = False  # one clip was named, which holds for all
         first = self._first_clip()
         self.width, self.height, self.fps = first.width, first.height, first.fps
         self.num_frames = None
@@ -275,6 +276,7 @@ class ClipFolder(Source):
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             for line in self._video.warnings:
                 self._on_notice(line)
+            self._is_interlaced = self._video.is_interlaced
             self.is_cut_off = self._video.is_cut_off  # of the last clip, which ends the frames
 
     def _whole_frames(self, video: VideoFile) -> Iterator[Frame]:
@@ -314,6 +316,7 @@ class ClipFolder(Source):
                 f"{video.width}x{video.height} px; the clip was left out"
             )
             return None
+        video.is_interlaced = self._is_interlaced
         return video
 
     def _has_more(self, path: Path) -> bool:

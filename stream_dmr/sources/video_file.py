@@ -8,7 +8,7 @@ from threading import Lock
 
 import cv2
 import numpy as np
-from jaxtyping import Int16, UInt8
+from jaxtyping import UInt8
 
 from stream_dmr.errors import SourceError
 from stream_dmr.files import open_file
@@ -49,6 +49,7 @@ class VideoFile(Source):
         self._is_closed = False
         self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
         self._num_combed = 0
+        self.is_interlaced = False  # True once it was named
         self._later_ns = 0  # added to the times of the container since its clock went back
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
@@ -89,7 +90,7 @@ class VideoFile(Source):
             frame_index += 1
             if self._decoder.num_errors and not self._first_error:
                 self._first_error = frame_index
-            if frame_index % _COMB_EVERY == 0 and self._num_combed < _COMBED_PICTURES:
+            if frame_index % _COMB_EVERY == 0 and not self.is_interlaced:
                 self._note_combs(pending.image)
             timestamp_ns = self._time_ns(pending, frame_index, previous_ns=timestamp_ns)
             yield Frame(
@@ -144,10 +145,11 @@ class VideoFile(Source):
 
     def _note_combs(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
         """Warn once of interlaced pictures: a fish that moves along itself looks longer in them."""
-        grey = image[..., 1].astype(np.int16)
+        grey = image[..., 1]
         lying = _striped(grey[:, ::4])
         self._num_combed += lying > _MIN_COMBED + _COMBED_RATIO * _striped(grey[::4].T)
         if self._num_combed == _COMBED_PICTURES:
+            self.is_interlaced = True
             self._on_notice(
                 f"{self.name}: its pictures seem interlaced (every second line is of another "
                 "moment), so that moving fish look too long; deinterlace the film and measure "
@@ -190,9 +192,9 @@ class VideoFile(Source):
             )
 
 
-def _striped(grey: Int16[np.ndarray, "H W"]) -> float:
+def _striped(grey: UInt8[np.ndarray, "H W"]) -> float:
     """Fraction of the pixels from which a column goes up and down in turns for four lines."""
-    steps = np.diff(grey, axis=0)
+    steps = np.diff(grey.astype(np.int16), axis=0)
     up, down = steps > _COMB_STEP, steps < -_COMB_STEP
     turns = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
     return float(np.count_nonzero(turns[2:] & turns[1:-1] & turns[:-2])) / grey.size

@@ -29,12 +29,18 @@ def clip(
     num_frames: int = 4,
     size: tuple[int, int] = (64, 48),
     fps: float = 25.0,
+    is_combed: bool = False,
 ) -> Path:
-    """Grey pictures `first`, `first` + 1, ..., `fps` a second; whole for long."""
+    """Grey pictures `first`, `first` + 1, ..., `fps` a second; whole for long.
+
+    `is_combed`: every second line is brighter.
+    """
     draft = path.with_suffix(".draft.avi")
     writer = cv2.VideoWriter(str(draft), cv2.VideoWriter_fourcc(*"FFV1"), fps, size)
     for k in range(first, first + num_frames):
-        writer.write(np.full((size[1], size[0], 3), 8 * k, np.uint8))
+        image = np.full((size[1], size[0], 3), 8 * k % 200, np.uint8)
+        image[1::2] += np.uint8(50 * is_combed)
+        writer.write(image)
     writer.release()
     os.utime(draft, (OLD_S + first, OLD_S + first))
     return draft.rename(path)
@@ -59,6 +65,15 @@ def test_clips_follow_each_other_by_name(tmp_path: Path):
     assert times[4] == (OLD_S + 9) * 10**9 - 160_000_000
     assert times[8] - times[4] == 10**9
     assert folder.warnings == []
+
+
+def test_interlaced_clips_are_named_once(tmp_path: Path):
+    for name in ("a", "b"):
+        clip(tmp_path / f"{name}.avi", first=1, num_frames=60, is_combed=True)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    assert len(list(folder)) == 120
+    (warning,) = folder.warnings
+    assert "interlaced" in warning
 
 
 def test_clips_that_overlap_in_time_are_set_one_after_the_other(tmp_path: Path):
