@@ -7,6 +7,7 @@ compared with the scene at the first use of the calibration in the output folder
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -190,7 +191,10 @@ def decode_scene(data: bytes) -> StaticScene | None:
 
 
 class DriftAlarms:
-    """Monitors scene and fits of a run; notes alarms in the store and returns flags for lengths."""
+    """Monitors scene and fits of a run; notes alarms in the store and returns flags for lengths.
+
+    Frames may come in one thread and fish in another.
+    """
 
     def __init__(
         self,
@@ -207,6 +211,7 @@ class DriftAlarms:
         """
         self._store = store
         self._on_alarm, self._on_notice = on_alarm, on_notice
+        self._lock = Lock()
         stored = store.scene()
         reference = None if stored is None else decode_scene(stored)
         self._scene = SceneMonitor(settings, reference=reference)
@@ -229,11 +234,12 @@ class DriftAlarms:
         return list(self._alarms)
 
     def _report_changes(self, timestamp_ns: int) -> None:
-        alarms = tuple(alarm for alarm in (self._scene.alarm, self._fits.alarm) if alarm)
-        if [*map(cause_of, alarms)] == [*map(cause_of, self._alarms)]:
-            return
-        self._alarms = alarms
-        self._on_alarm(alarms)
-        text = "; ".join(alarms) or "the camera sees again what it was calibrated for"
-        self._store.note("drift", text, timestamp_ns=timestamp_ns)
-        self._on_notice(f"{text}; lengths are marked from now on" if alarms else text)
+        with self._lock:  # a frame and a fish may come at once
+            alarms = tuple(alarm for alarm in (self._scene.alarm, self._fits.alarm) if alarm)
+            if [*map(cause_of, alarms)] == [*map(cause_of, self._alarms)]:
+                return
+            self._alarms = alarms
+            self._on_alarm(alarms)
+            text = "; ".join(alarms) or "the camera sees again what it was calibrated for"
+            self._store.note("drift", text, timestamp_ns=timestamp_ns)
+            self._on_notice(f"{text}; lengths are marked from now on" if alarms else text)

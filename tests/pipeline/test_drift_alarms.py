@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -41,6 +42,25 @@ def test_worse_fish_are_flagged_and_the_change_is_noted_once(store: LengthStore)
     assert flags_of(alarms, rng.normal(0.93, 0.01, 30))[-1] == []
     assert len(notices) == 2
     assert causes == [tuple(flags[-1]), ()]
+
+
+def test_what_another_thread_finds_meanwhile_is_told_afterwards(store: LengthStore):
+    rng, causes, others = np.random.default_rng(1), list[Sequence[str]](), list[Thread]()
+
+    def tell(told: Sequence[str]) -> None:
+        if not others:  # the alarm ends in the other thread while its begin is told
+            others.append(Thread(target=flags_of, args=(alarms, rng.normal(0.93, 0.01, 30))))
+            others[0].start()
+            others[0].join(0.5)
+        causes.append(told)
+
+    alarms = DriftAlarms(store, SETTINGS, on_alarm=tell, on_notice=ignore)
+    flags_of(alarms, rng.normal(0.93, 0.01, 20))
+    worse = iter(rng.normal(0.85, 0.01, 30))
+    while not causes:
+        alarms.take_fish(float(next(worse)), timestamp_ns=1)
+    others[0].join()
+    assert causes[-1] == ()
 
 
 def test_a_fish_without_an_iou_changes_nothing(store: LengthStore):
