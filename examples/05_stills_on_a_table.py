@@ -1,6 +1,6 @@
 """Measure single pictures: python examples/05_stills_on_a_table.py [OUT]
 
-Every picture stands for itself: one good picture gives a length. Here four frames of the embedded
+Every picture stands for itself: one good picture gives a length. Here four frames of the bundled
 video serve as pictures. Its fish hang; for fish on a table calibrate with the board on the table
 and write `pose="lying"`. The same by the command line:
 
