@@ -14,12 +14,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.fitting.two_masks import CommonMesh, Sight, TwoMaskFitter
 from stream_dmr.localization.localize_fish import LocalizeSettings, localize, mask_std_ratio
-from stream_dmr.localization.two_views import (
-    View,
-    agreed,
-    place_between,
-    second_from_first,
-)
+from stream_dmr.localization.two_views import View, agreed, place_between, second_from_first
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LocalizedFish
 from stream_dmr.pipeline.pair_fish import (
     BY_ONE_CAMERA,

@@ -59,7 +59,8 @@ class Segmenter(Protocol):
 
 # The fish in a box, half-open in pixels of a crop (BGR).
 Segment = Callable[[UInt8[np.ndarray, "S S 3"], Float[np.ndarray, "4"]], SegmentedFish]
-_QUARTER = np.array([[0, 1], [-1, 0]])  # turns x, y as np.rot90 turns a picture
+# Turns of x, y, as np.rot90 turns a picture: by none, one, two and three quarters.
+_TURNS = [np.linalg.matrix_power([[0, 1], [-1, 0]], number) for number in range(4)]
 
 
 def segment_upright_as_well(
@@ -74,11 +75,10 @@ def segment_upright_as_well(
     if found.ends is None:
         return found
     head_xy = found.ends.head_px - found.ends.tail_px
-    turns = [np.linalg.matrix_power(_QUARTER, number) for number in range(4)]
-    number = int(np.argmin([(turn @ head_xy)[1] for turn in turns]))
+    number = int(np.argmin([(turn @ head_xy)[1] for turn in _TURNS]))
     if number == 0:
         return found
-    turn, size = turns[number], len(image)
+    turn, size = _TURNS[number], len(image)
     corners = (bbox_xyxy_px.reshape(2, 2) - size / 2) @ turn.T + size / 2
     box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
     upright = segment(np.ascontiguousarray(np.rot90(image, number)), box)

@@ -123,8 +123,7 @@ class ReviewQueue:
         return f"Fish {last.track_id}{video}: {last.in_words}" if last else ""
 
     def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
-        report, _, _ = self._recorder(run).snapshot()
-        placed = replace(self.placed[run], report=report)
+        placed = self.placed[run]  # verdicts change its fish, but nothing that a row takes of it
         fish = {seen.estimate.track_id: seen for seen in self._fish(run, set(track_ids))}
         lost = [track_id for track_id in track_ids if track_id not in fish]
         gone = [{"id": placed.row_id(track_id), "gone": True} for track_id in lost]
