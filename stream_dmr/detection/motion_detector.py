@@ -19,7 +19,7 @@ from stream_dmr.detection.background_model import (
     warp,
 )
 from stream_dmr.detection.detector import Candidate
-from stream_dmr.detection.picture_views import brightening_power
+from stream_dmr.detection.picture_views import brightening_power, shrunk
 from stream_dmr.geometry import components, oriented_extent
 from stream_dmr.messages import Frame
 from stream_dmr.settings import Settings
@@ -196,10 +196,6 @@ _MAX_STILL_SHARE = 0.1  # of a blob's pixels changed; with fewer it stands still
 # Share of foreign pixels from which on the background is learnt anew: after a black picture, a lamp
 # that is switched on or another shot it would take hundreds of pictures.
 _ANOTHER_SCENE = 0.5
-# Most levels by which an encoder changes a picture that it repeats: between pictures of 20 films
-# the largest change was 10 and more, but in one of a pond at rest. See docs/research/tracking.md.
-_MAX_REPEAT_CHANGE = 6.0
-_MAX_REPEATS = 3  # consecutive ones; with more the scene is at rest
 _STILL_RATE = 0.5  # learning rate of foreign blobs that stand still
 # By the levels of a mask of moving pixels: errors of the model must fade there at last.
 _RATES = np.array([1] + [0.02] * 255, np.float32)
@@ -245,8 +241,6 @@ class MotionDetector:
         self._settings = settings
         self._camera = CameraMotion()
         self._background: BackgroundModel | None = None
-        self._repeats = 0  # of the last picture, consecutive
-        self._last: tuple[np.ndarray, np.ndarray] | None = None  # picture, and what moves in it
         self._before: UInt8[np.ndarray, "h w 3"] | None = None  # last picture, background's pixels
         self._is_foreign: Bool[np.ndarray, "h w"] | None = None  # in the last picture's pixels
         self._background_from_picture: Affine = _IDENTITY
@@ -258,11 +252,7 @@ class MotionDetector:
         height, width = frame.image.shape[:2]
         scale = min(1.0, self._settings.motion_working_px / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        small = _shrink(frame.image, size)
-        moving = self._moved_before(small)
-        if moving is None:
-            moving = self._find_moving(small)
-            self._last, self._repeats = (small, moving), 0
+        moving = self._find_moving(shrunk(frame.image, size))
         blobs, refused = fish_blobs(
             moving,
             min_length_px=self._settings.motion_min_length * max(size),
@@ -270,16 +260,6 @@ class MotionDetector:
         )
         self.refused.update(refused)
         return [_candidate(blob, width=width, height=height) for blob in blobs]
-
-    def _moved_before(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"] | None:
-        """What moved in the last picture if this one repeats it: its fish are not at rest."""
-        if self._last is None or self._repeats == _MAX_REPEATS:
-            return None
-        picture, moving = self._last
-        if cv2.norm(small, picture, cv2.NORM_INF) > _MAX_REPEAT_CHANGE:
-            return None
-        self._repeats += 1
-        return moving
 
     def scene_point(
         self, point: Float[np.ndarray, "2"], *, shape: tuple[int, ...]
@@ -428,14 +408,6 @@ def _count_changed(
 
 def _planes(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "3 h w"]:
     return np.array(cv2.split(picture))
-
-
-def _shrink(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-    """Area means; halves first, which is five times as fast as one step by an odd factor."""
-    while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
-        half = (image.shape[1] // 2, image.shape[0] // 2)
-        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-    return cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
 
 
 def _candidate(blob: Bool[np.ndarray, "h w"], *, width: int, height: int) -> Candidate:

@@ -1,13 +1,18 @@
-"""Detect from a small grey picture whether anything happens in it.
+"""Detect from a small picture whether anything happens in it, and whether it is a new one at all.
 
 Water moves all the time, more under wind, spray or a camera that sways. A change is therefore
 measured twice against the scene itself: each cell of the picture against the usual change of that
 cell, and the largest such change against the largest change of most pictures.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
+
+from stream_dmr.detection.picture_views import brightened, shrunk
+from stream_dmr.messages import Frame
 
 # Chosen on made clips of water, the shared scenes and real clips; see docs/research/raw-video.md.
 _LONGER_PX = 160  # of the small picture, whose pixels are the cells
@@ -19,6 +24,10 @@ _RATIO = 1.2  # of the largest change to the usual one, from which on something 
 # Factors of the usual change, up and down, a picture: in balance two pictures in three exceed it.
 _UP, _DOWN = 1 + 0.01 * 2 / 3, 1 - 0.01 * 4 / 3
 _FIRST_PICTURES = 30  # all are examined, until the usual change is known
+# Most levels by which an encoder changes a picture that it repeats, in means over so many px of a
+# picture of so many. Two were the most; whatever moved changed five and more.
+_MAX_REPEAT_CHANGE, _REPEAT_CELL_PX, _REPEAT_PX = 2.5, 5, 480
+_MAX_REPEATS = 15  # consecutive ones; then the scene is at rest, and is examined
 
 
 class StillWater:
@@ -69,3 +78,29 @@ def _small_grey(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "h w"]
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     few = np.ascontiguousarray(image[::step, ::step, 1])
     return cv2.resize(few, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+class Repeats:
+    """Tells pictures that a recorder repeats: it makes more than its camera, or fills a gap."""
+
+    def __init__(self) -> None:
+        self._last: Float32[np.ndarray, "h w"] | None = None  # of the last that was none
+        self._num = 0  # since then
+
+    def is_repeat(self, frame: Frame) -> bool:
+        """True if the next picture shows what the one before it shows."""
+        height, width = frame.image.shape[:2]
+        scale = min(1.0, _REPEAT_PX / max(height, width))
+        small = shrunk(frame.image, (max(1, round(width * scale)), max(1, round(height * scale))))
+        grey = cv2.cvtColor(brightened(replace(frame, image=small)).image, cv2.COLOR_BGR2GRAY)
+        means = cv2.blur(grey.astype(np.float32), (_REPEAT_CELL_PX, _REPEAT_CELL_PX))
+        is_new = (
+            self._last is None
+            or self._last.shape != means.shape
+            or self._num == _MAX_REPEATS
+            or cv2.norm(means, self._last, cv2.NORM_INF) > _MAX_REPEAT_CHANGE
+        )
+        self._num = 0 if is_new else self._num + 1
+        if is_new:
+            self._last = means
+        return not is_new

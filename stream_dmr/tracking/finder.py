@@ -28,6 +28,7 @@ from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.detection.network_detectors import OnnxDetector
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.detection.picture_views import find_in_still
+from stream_dmr.detection.still_water import Repeats
 from stream_dmr.errors import ConfigError
 from stream_dmr.geometry import box_iou, whole_pixels
 from stream_dmr.messages import FishCrop, Frame
@@ -173,6 +174,7 @@ class TrackedFish:
         self._tracker = Tracker(settings)
         self._confirmation = FishConfirmation(settings)
         self._corrector = BoxCorrector()
+        self._repeats, self._is_repeat = Repeats(), False  # the latter of the last frame
         self._settings = settings
         self._seen = Sightings()
         # Single pictures in which a detector's boxes are all that speaks for a fish.
@@ -183,14 +185,22 @@ class TrackedFish:
         self._name = ""  # of the last picture
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """All tracks seen in a frame, by track number. Frames must come in order."""
+        """All tracks seen in a frame, by track number. Frames must come in order.
+
+        None in a picture that repeats the one before: its fish neither rest nor are seen once more.
+        """
+        self._name, self._is_repeat = frame.source, False
+        self._seen.frames += 1
         if self._are_stills and not self.has_masks:
             candidates = find_in_still(self._detector, frame)
+        elif self._passes_over(frame):
+            candidates = []
+        elif self._repeats_the_last(frame):
+            self._is_repeat = True
+            return []
         else:
-            candidates = [] if self._passes_over(frame) else self._detector.find(frame)
+            candidates = self._detector.find(frame)
         tracked = self._tracker.step(frame, candidates)
-        self._name = frame.source
-        self._seen.frames += 1
         self._seen.candidates += len(candidates)
         scores = [candidate.score for candidate in candidates]
         self._seen.best_score = max([self._seen.best_score, *scores])
@@ -230,6 +240,14 @@ class TrackedFish:
             and self._detector.passes_over(frame, is_followed=self._tracker.is_following)
         )
 
+    def _repeats_the_last(self, frame: Frame) -> bool:
+        """True if a picture of a video is none of its own; boxes of a file are for every picture."""
+        return (
+            self._settings.across_frames
+            and not isinstance(self._detector, BoxDetector)
+            and self._repeats.is_repeat(frame)
+        )
+
     def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
         """Look closer at some of the moving tracks that do not yet count as fish."""
         if not isinstance(self._detector, FusedDetector):
@@ -266,6 +284,8 @@ class TrackedFish:
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
         """Confirmed fish by track number; `crops` are those of all detections of the frame."""
+        if self._is_repeat:
+            return {}
         self._corrector.update(crops)
         self._confirmation.forget_all_but(self._tracker.open_numbers)
         fish = {

@@ -10,6 +10,7 @@ from its track in the tracker, and stays inside of segmentation. `TrackNumbering
 `track_id` of the FishCrop, once; all later messages, tables, databases and recordings have that.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -32,6 +33,8 @@ _MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
 _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
 _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
+_KNOWN_STEPS = 31  # frames whose median step is the usual one
+_MAX_STEPS = 60  # that count, where a broken file's times are none
 _MIN_PAUSE_NS = 2_000_000_000  # chosen: by then another fish may hang in a fish's place
 # An exposure that changes at once changes all colours: the light in which they are compared follows
 # within some thirty frames. A few grey levels of dark water are noise, and say nothing of fish in a
@@ -69,8 +72,9 @@ class Tracker:
         self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
         self._num_started = 0
         self._light = 0.0  # median grey level + 1 of late; 0: unknown
-        self._last_ns = 0  # capture time of the last frame
-        self._step_ns = 0  # from the frame before to it, or from 0 to the first
+        self._last_ns: int | None = None  # capture time of the last frame
+        self._steps_ns: deque[int] = deque(maxlen=_KNOWN_STEPS)  # from one to the next of late
+        self._now = 0  # usual steps that passed; all counts of frames are of these
 
     @property
     def is_following(self) -> bool:
@@ -95,16 +99,16 @@ class Tracker:
             for candidate in candidates
             if candidate.score >= self._settings.min_score
         ]
-        if not self._settings.across_frames or self._is_after_pause(frame.timestamp_ns):
+        if not self._advance(frame.timestamp_ns) or not self._settings.across_frames:
             self.forget_tracks()
         for track in (*self._tracks, *self._hidden):
-            track.predict(frame.frame_index)
+            track.predict(self._now)
         observations = [piece for blob in observations for piece in self._split(frame, blob)]
         observations = self._without_merged(observations)
         unassigned = self._assign(observations)
         self._keep_covered(observations)
         self._drop_lost(frame)
-        self._start_tracks(self._reidentify(unassigned), frame.frame_index)
+        self._start_tracks(self._reidentify(unassigned))
         seen = [track.number for track in self._tracks if track.lost_frames == 0]
         for track in self._tracks:
             is_newcomer = track.began_as_piece and track.frames_seen < _MIN_KNOWN_FRAMES
@@ -123,12 +127,19 @@ class Tracker:
             return frame
         return replace(frame, image=cv2.convertScaleAbs(frame.image, alpha=gain))
 
-    def _is_after_pause(self, timestamp_ns: int) -> bool:
-        """True after a gap in time, as of a camera that films what moves, but not in time-lapse."""
-        before_ns, step_ns = self._step_ns, timestamp_ns - self._last_ns
-        self._last_ns, self._step_ns = timestamp_ns, step_ns
-        longest_ns = max(_MIN_PAUSE_NS, (self._settings.max_lost_frames + 1) * before_ns)
-        return before_ns > 0 and step_ns > longest_ns
+    def _advance(self, timestamp_ns: int) -> bool:
+        """Go on to a frame's time; False after a pause, as of a camera that films what moves.
+
+        Pictures that a camera or a network lost leave a gap in the times, not in the indices.
+        """
+        last_ns, self._last_ns = self._last_ns, timestamp_ns
+        if last_ns is None:
+            return True
+        self._steps_ns.append(timestamp_ns - last_ns)
+        usual_ns = float(np.median(self._steps_ns))
+        self._now += int(np.clip(round(self._steps_ns[-1] / usual_ns), 1, _MAX_STEPS))
+        longest_ns = max(_MIN_PAUSE_NS, (self._settings.max_lost_frames + 1) * usual_ns)
+        return self._steps_ns[-1] <= longest_ns
 
     def _inside(self, observation: Observation) -> list[Track]:
         """The tracks whose predicted box lies mostly inside an observation's."""
@@ -227,7 +238,7 @@ class Tracker:
         is_covered = track.snapshot is not None and track.snapshot.is_covered
         return max(self._settings.max_hidden_frames, _MAX_COVERED_FRAMES if is_covered else 0)
 
-    def _start_tracks(self, observations: Sequence[Observation], frame_index: int) -> None:
+    def _start_tracks(self, observations: Sequence[Observation]) -> None:
         """Start a track for each observation that is no part of a fish that is seen."""
         seen = [track for track in self._tracks if track.lost_frames == 0]
         for observation in observations:
@@ -237,7 +248,7 @@ class Tracker:
             )
             if observation.is_piece or is_apart:
                 self._num_started += 1
-                self._tracks.append(Track(observation, self._num_started, frame_index))
+                self._tracks.append(Track(observation, self._num_started, self._now))
 
     def _reidentify(self, unassigned: Sequence[Observation]) -> list[Observation]:
         """Settle the identities of fish that were merged or lost; return what is still unassigned.

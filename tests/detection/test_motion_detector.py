@@ -65,7 +65,7 @@ def test_what_stands_still_is_no_fish():
     assert not any(find_all([stained] * 6))
     found = find_all([wall] * 5 + [stained] * 12)
     assert any(found[5:9])  # it has just come
-    assert not any(found[9:])  # and this is no picture that a recorder repeats
+    assert not any(found[7:])
 
 
 @pytest.mark.parametrize(("level", "is_found"), [(20, True), (90, False)])
@@ -94,27 +94,6 @@ def test_after_a_black_picture_or_a_lamp_switched_on_fish_are_found_at_once(befo
     dark = [(before * wall).astype(np.uint8)] * 8
     found = find_all([*dark, *(draw_fish(wall, 60 + 8 * i, 120) for i in range(16))])
     assert sum(len(candidates) == 1 for candidates in found[12:]) >= 10
-
-
-@pytest.mark.parametrize("times", [2, 3])
-def test_pictures_that_are_repeated_show_what_they_showed(times: int):
-    places = [(60 + 8 * i, 60 + 4 * i) for i in range(16)]
-    images = [draw_fish(wall, *p) for wall, p in zip(pan(5, (0.0, 0.0), 16), places, strict=True)]
-    rng = np.random.default_rng(0)
-    encoded = [
-        np.clip(image + rng.integers(-2, 3, image.shape), 0, 255).astype(np.uint8)
-        for image in images
-        for _ in range(times)
-    ]
-    once, repeated = find_all(encoded[::times]), find_all(encoded)
-    assert any(once)
-    for before, *after in zip(once, *(repeated[k::times] for k in range(times)), strict=True):
-        for found in after:
-            assert boxes_of(found) == boxes_of(before)
-
-
-def boxes_of(found: list[Candidate]) -> list[list[float]]:
-    return [candidate.bbox_xyxy_px.tolist() for candidate in found]
 
 
 def test_equal_pictures_give_equal_fish():

@@ -1,4 +1,7 @@
-"""Still water is passed over; what enters it is looked at at once, what hangs in it soon."""
+"""Still water is passed over; what enters it is looked at at once, what hangs in it soon.
+
+Repeated pictures are passed over as well.
+"""
 
 from collections.abc import Iterator
 
@@ -121,3 +124,29 @@ def test_the_same_fish_are_found_as_by_looking_at_every_picture():
     pairs = [(a, b) for a, b in zip(by_all, by_some, strict=True) if a is not None]
     assert len(pairs) > 60
     assert all(box_iou(a, b) > 0.95 for a, b in pairs if b is not None)
+
+
+def crossing(num: int) -> list[np.ndarray]:
+    return [draw_fish(one, (40 + 8 * i, 120)) for i, one in enumerate(water(num))]
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_fish_of_pictures_that_a_recorder_repeats_are_seen_once(times: int):
+    rng = np.random.default_rng(0)
+    pictures = [
+        cv2.add(picture, rng.integers(-2, 3, picture.shape, np.int16), dtype=cv2.CV_8U)
+        for picture in crossing(24)
+        for _ in range(times)
+    ]
+    once, _ = seen_in(pictures[::times], every_s=0.5)
+    repeated, _ = seen_in(pictures, every_s=0.5)
+    assert sum(box is not None for box in once) > 15
+    for box, same in zip(once, repeated[::times], strict=True):
+        np.testing.assert_array_equal(box, same)
+    assert all(box is None for i, box in enumerate(repeated) if i % times > 0)
+
+
+def test_a_scene_at_rest_is_examined_now_and_then():
+    pictures = crossing(4)
+    boxes, _ = seen_in([*pictures, *[pictures[-1]] * 60], every_s=0.5)
+    assert 3 <= sum(box is not None for box in boxes[4:]) <= 6

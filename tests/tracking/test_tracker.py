@@ -286,6 +286,17 @@ def test_dropped_frames_are_a_gap_like_any_other():
     assert ids(follow(frames, only=kept)) == [[1]] * 26
 
 
+@pytest.mark.parametrize("lost", [3, 5])
+def test_pictures_that_a_camera_lost_leave_a_gap_in_time_only(lost: int):
+    tracker = Tracker(TrackerSettings())
+    numbers = []
+    for index, moment in enumerate([*range(8), *range(8 + lost, 16 + lost)], start=1):
+        spots = [climbing(moment, speed=10.0)]
+        frame = replace(spots_frame(spots, index), timestamp_ns=moment * 66_666_667)
+        numbers += [seen.track_number for seen in tracker.step(frame, spots_candidates(spots))]
+    assert numbers == [1] * 16
+
+
 def test_ids_count_from_1_and_are_never_given_twice():
     passage = [[climbing(i, speed=30)] for i in range(14)]
     found = ids(follow((passage + [[]] * 10) * 5))
