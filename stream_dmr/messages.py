@@ -75,7 +75,8 @@ class CropQuality:
     # Change of the fish's length in a box that extends beyond its ends, over its length; None: not
     # looked at.
     length_doubt: float | None = None
-    # Probability that the mask lacks snout or tail, by a network; None: not judged.
+    # Probability that the mask lacks snout or tail, by a network; 1 if another fish may hide one;
+    # None: not judged.
     missing_end: float | None = None
 
 

@@ -5,14 +5,14 @@ a fish's tail and a box without it, or a fish and its fin, overlap too little to
 masks decide: two fish share no pixels.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from stream_dmr.detection.box_files import UNKNOWN_ID, load_boxes
 from stream_dmr.detection.detector import Detector
@@ -30,7 +30,7 @@ from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.detection.picture_views import find_in_still
 from stream_dmr.detection.still_water import Repeats
 from stream_dmr.errors import ConfigError
-from stream_dmr.geometry import box_iou, whole_pixels
+from stream_dmr.geometry import box_iou, long_axis, whole_pixels
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.tracking.box_correction import BoxCorrector
@@ -156,11 +156,61 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
     """
     if box_iou(crop.bbox_xyxy_px, other.bbox_xyxy_px) == 0:
         return 0.0
+    both = crop.mask & _seen_in(crop, other)
+    return np.count_nonzero(both) / max(np.count_nonzero(crop.mask), 1)
+
+
+def _seen_in(crop: FishCrop, other: FishCrop) -> Bool[np.ndarray, "S S"]:
+    """Another crop's mask of the same frame, in the pixels of this one."""
     crop_from_other = crop.crop_camera.K @ np.linalg.inv(other.crop_camera.K)
-    seen = cv2.warpAffine(
-        other.mask.view(np.uint8) * np.uint8(255), crop_from_other[:2], crop.mask.shape[::-1]
-    )
-    return np.count_nonzero(crop.mask & (seen > 127)) / max(np.count_nonzero(crop.mask), 1)
+    layer = other.mask.view(np.uint8) * np.uint8(255)
+    return cv2.warpAffine(layer, crop_from_other[:2], crop.mask.shape[::-1]) > 127
+
+
+# Of the length: what counts as an end, and how far beyond it another fish is looked for; how far to
+# the sides, where a fish has others only if it lies upon them. Chosen.
+_END, _ASIDE = 0.03, 0.15
+
+
+def goes_under(crop: FishCrop, others: Iterable[FishCrop]) -> bool:
+    """True if snout or tail ends at another fish's mask, which may hide the rest of it.
+
+    An end with another fish on both its sides lies upon that fish.
+    """
+    rows, columns = np.nonzero(crop.mask)
+    covered = np.zeros_like(crop.mask)
+    for other in others:
+        covered |= _seen_in(crop, other)
+    if len(rows) < 3 or not covered.any():
+        return False
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    axis = long_axis(points)
+    length_px = float(np.ptp(points @ axis))
+    for along in (axis, -axis):
+        place = points @ along
+        end = points[place >= place.max() - _END * length_px]
+        aside = _ASIDE * length_px * np.array([-along[1], along[0]])
+        beyond, left, right = (
+            _is_mostly(covered, end + step) for step in (_END * length_px * along, aside, -aside)
+        )
+        if beyond and not (left and right):
+            return True
+    return False
+
+
+def _is_mostly(layer: Bool[np.ndarray, "S S"], points: Float[np.ndarray, "N 2"]) -> bool:
+    """True if more than half of the pixels (x, y) are in a layer."""
+    x, y = np.round(points).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < layer.shape[1]) & (y < layer.shape[0])
+    return bool(np.count_nonzero(layer[y[inside], x[inside]]) > len(points) / 2)
+
+
+def _judged(crops: Mapping[int, FishCrop], track: int, fish: Collection[int]) -> FishCrop:
+    """The crop of one of a still's fish; without an end if it may go on under another one."""
+    crop = crops[track]
+    if not goes_under(crop, [crops[other] for other in fish if other != track]):
+        return crop
+    return replace(crop, quality=replace(crop.quality, missing_end=1.0))
 
 
 _MAX_AT_ONCE = 2  # closer looks in a frame; each takes as long as four looks at a whole frame
@@ -299,7 +349,7 @@ class TrackedFish:
         }
         if self._are_stills:
             single = without_repeats({track: crops[track] for track in fish}, self._scores)
-            fish = {track: fish[track] for track in single}
+            fish = {track: [_judged(crops, track, single)] for track in single}
             if not fish:
                 self._seen.without += 1
                 if len(self._seen.some_without) < _MAX_NAMED:

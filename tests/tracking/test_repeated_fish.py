@@ -13,7 +13,7 @@ from stream_dmr.camera import Camera
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.detection.picture_views import find_both_ways, find_in_still
 from stream_dmr.messages import FishCrop
-from stream_dmr.tracking.finder import share_inside, without_repeats
+from stream_dmr.tracking.finder import goes_under, share_inside, without_repeats
 from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
 
@@ -58,6 +58,35 @@ def test_an_empty_mask_lies_nowhere():
     empty = crop_with(100, 300)
     empty = replace(empty, mask=np.zeros_like(empty.mask))
     assert share_inside(empty, crop_with(100, 300)) == share_inside(crop_with(1, 9), empty) == 0
+
+
+@pytest.mark.parametrize(
+    ("other", "is_under"),
+    [
+        ((400, 470, 80, 400), True),  # across its tail
+        ((30, 101, 80, 400), True),  # across its head
+        ((420, 490, 80, 400), False),  # water between
+        ((100, 400, 240, 280), False),  # side by side
+        ((380, 560, 250, 280), False),  # past a corner of its tail
+    ],
+)
+def test_a_fish_goes_under_another_one_at_which_its_end_ends(
+    other: tuple[int, int, int, int], is_under: bool
+):
+    fish = crop_with(100, 400, 200, 240)
+    assert goes_under(fish, [crop_with(10, 60, 20, 40), crop_with(*other)]) == is_under
+
+
+def test_a_fish_that_lies_upon_another_one_does_not_go_under_it():
+    whole = np.zeros((480, 640), bool)
+    whole[80:400, 350:450] = True
+    whole[200:240, :400] = False
+    below = crop_of(whole, CAMERA, box=[350, 80, 450, 400])
+    assert not goes_under(crop_with(100, 400, 200, 240), [below])
+    assert not goes_under(below, [crop_with(100, 400, 200, 240)])
+    empty = replace(below, mask=np.zeros_like(below.mask))
+    assert not goes_under(empty, [below])
+    assert not goes_under(below, [empty])
 
 
 class _Nearsighted:

@@ -223,6 +223,21 @@ def test_a_picture_shows_no_fish_inside_of_another(across_frames: bool):
     assert len(shown) == 2
 
 
+def test_a_still_shows_no_end_of_a_fish_that_goes_under_another_one():
+    class Boxes:
+        refused: ClassVar[dict[str, int]] = {}
+
+        def find(self, frame: Frame) -> list[Candidate]:
+            boxes = ([50.0, 80, 200, 120], [198.0, 20, 250, 200]) * is_whole_picture(frame)
+            return [Candidate(bbox_xyxy_px=np.array(box), score=0.8) for box in boxes]
+
+    settings = TrackFishSettings(min_track_frames=1, across_frames=False, min_score=0.05)
+    fish, frame = TrackedFish(Boxes(), settings), marked_frame(1)
+    shown = fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
+    ends = {one.bbox_xyxy_px[0]: one.quality.missing_end for [one] in shown.values()}
+    assert ends == {50: 1.0, 198: None}
+
+
 class BlindFromAfar(FusedDetector):
     """Sees how much what moves looks like a fish, but only from nearby."""
 
