@@ -105,7 +105,8 @@ class Reason(StrEnum):
         "end not seen",
         _FRAME,
         "the mask seems to lack snout or tail: `[localize] max_missing_end`",
-        "look at the mask: dark ends want light, or draw the box around all of the fish",
+        "look at the mask: dark ends want light, and fish no other fish upon them; or draw the box "
+        "around all of the fish",
     )
     POOR_FIT = (
         "poor fit",
