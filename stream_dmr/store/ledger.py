@@ -10,7 +10,7 @@ import sqlite3
 import stat
 import time
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -186,11 +186,6 @@ def _load_key(path: Path, name: str, kind: type[K], load: Callable[[bytes], obje
 def _canonical(values: Mapping[str, object]) -> bytes:
     # Bytes, which no row of ours has, are signed nowhere.
     return json.dumps(values, sort_keys=True, separators=(",", ":"), default=repr).encode()
-
-
-def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
-    """All entries in their order; none if nothing was signed."""
-    return records(database, LEDGER, ChainEntry)
 
 
 def last_entry(database: sqlite3.Connection) -> ChainEntry | None:

@@ -37,7 +37,6 @@ T = TypeVar("T")
 Statement = tuple[str, tuple[object, ...]]
 """SQL, and the values of its marks."""
 
-
 # Columns that older databases lack are the last of their table, and may be NULL.
 _SQL = """
 CREATE TABLE runs (
@@ -521,9 +520,7 @@ def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object
     }
 
 
-def read_estimates(
-    database: sqlite3.Connection, *, after: int | None = None
-) -> list[LengthEstimate]:
+def read_estimates(database: sqlite3.Connection, *, after: int | None) -> list[LengthEstimate]:
     """The final estimates, see `rows`; the recordings have their smoothed series."""
     return [estimate_of(row) for row in rows(database, FISH, after=after)]
 

@@ -26,10 +26,10 @@ from stream_dmr.store.ledger import (
     Signer,
     load_public_key,
     make_key,
-    read_chain,
 )
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import ScaleCheck, add_check
+from stream_dmr.store.schema import LEDGER, records
 from tests.support.batch_engine import without_workers
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
@@ -100,7 +100,7 @@ def execute(folder: Path, *statements: str) -> None:
 
 def entries_of(folder: Path) -> list[ChainEntry]:
     with closing(sqlite3.connect(folder / "lengths.db")) as database:
-        return list(read_chain(database))
+        return records(database, LEDGER, ChainEntry)
 
 
 def write_entries(folder: Path, entries: list[ChainEntry]) -> None:
