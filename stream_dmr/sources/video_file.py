@@ -310,7 +310,8 @@ class SeekableVideo:
         wanted_ms = timestamp_ns / 1e6
         with self._lock:
             if not self._next_ms - self._tolerance_ms <= wanted_ms <= self._next_ms + _AHEAD_MS:
-                at_ms = self._seek(wanted_ms - _LEAD_MS)
+                self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, wanted_ms - _LEAD_MS))
+                at_ms = self._grab()
                 # FFmpeg searches by the mean rate, and finds nothing in a file of one picture.
                 if at_ms > wanted_ms + self._tolerance_ms:
                     self._capture.open(*self._opens)
@@ -323,11 +324,6 @@ class SeekableVideo:
                     return image if is_read and image.ndim == 3 else None
                 at_ms = self._grab()
             return None
-
-    def _seek(self, time_ms: float) -> float:
-        """Search, and take the next picture; its time."""
-        self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, time_ms))
-        return self._grab()
 
     def _grab(self) -> float:
         """Take the next picture; its time in ms, infinite at the end, after which is searched."""
