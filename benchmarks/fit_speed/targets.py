@@ -24,7 +24,6 @@ from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
 from stream_dmr.segmentation.open_segmenter import GrabCutSegmenter
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
-from stream_dmr.simulation.render import draw_mask
 from stream_dmr.simulation.simulated_fish import (
     HALIBUT,
     JOINT_ARCS,
@@ -33,6 +32,7 @@ from stream_dmr.simulation.simulated_fish import (
     straight_body,
 )
 from stream_dmr.template.template import Template, canonical_template
+from tests.support.simulated_view import draw_mask
 
 _NUM_FRAMES = 60
 

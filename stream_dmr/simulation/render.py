@@ -16,7 +16,6 @@ _TOWARDS_LIGHT = np.array([-0.35, -0.75, -0.56])  # camera frame: from above, be
 _AMBIENT = 0.5  # of the light; this and the direction are chosen
 _MARGIN_PX = 24  # around a patch, for blur and ragged outlines
 
-
 _skin = lru_cache(maxsize=64)(draw_skin)
 
 
@@ -28,21 +27,6 @@ class Patch:
     top: int
     mask: Bool[np.ndarray, "H W"]  # pixel centres inside the body
     colour: Float32[np.ndarray, "H W 3"]  # BGR, 0 outside the mask
-
-
-def draw_mask(
-    vertices_camera: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], *, camera: Camera
-) -> Bool[np.ndarray, "H W"]:
-    """The exact silhouette of a mesh: the pixels of the frame whose centres it covers.
-
-    Lens distortion acts on the vertices, so faces should be small. Depths must be positive.
-    """
-    pixels = camera.project(vertices_camera)
-    nothing = np.zeros((len(pixels), 0), np.float32)
-    face, _ = rasterize(
-        pixels, vertices_camera[:, 2], faces, nothing, width=camera.width, height=camera.height
-    )
-    return face >= 0
 
 
 def draw_fish_patch(posed: PosedFish, *, camera: Camera, seed: int) -> Patch:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
 from stream_dmr.simulation.rail_scene import PRESETS, draw_calibration, make_scene
-from stream_dmr.simulation.render import draw_fish_patch, draw_mask, frame_window
+from stream_dmr.simulation.render import draw_fish_patch, frame_window
 from stream_dmr.simulation.simulated_fish import (
     CENTER_ARC,
     HALIBUT,
@@ -26,7 +26,7 @@ from stream_dmr.simulation.simulated_fish import (
     straight_body,
     total_bend_rad,
 )
-from tests.support.simulated_view import draw_view
+from tests.support.simulated_view import draw_mask, draw_view
 
 SEEDS = st.integers(0, 2**32 - 1)
 PRESET_NAMES = st.sampled_from(sorted(PRESETS))

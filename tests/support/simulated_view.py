@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from stream_dmr.camera import Calibration
+from stream_dmr.camera import Calibration, Camera
 from stream_dmr.simulation.rail_scene import Preset, draw_calibration, draw_poses, find_preset
+from stream_dmr.simulation.render import rasterize
 from stream_dmr.simulation.simulated_fish import HangingPose, PosedFish, draw_fish, pose_fish
 
 _VIEW = 2  # key of a stream of random numbers of its own
@@ -31,7 +32,7 @@ class SimulatedView:
 
 
 def draw_view(*, preset: str, seed: int) -> SimulatedView:
-    """A random fish inside the picture; `render.draw_mask` gives its exact mask."""
+    """A random fish inside the picture; `draw_mask` gives its exact mask."""
     rng = np.random.default_rng((seed, _VIEW))
     calibration = draw_calibration(rng)
     place = np.array([rng.uniform(-900.0, 900.0), rng.uniform(-500.0, 500.0), 0.0])
@@ -40,6 +41,21 @@ def draw_view(*, preset: str, seed: int) -> SimulatedView:
     return SimulatedView(
         calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration)
     )
+
+
+def draw_mask(
+    vertices_camera: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], *, camera: Camera
+) -> Bool[np.ndarray, "H W"]:
+    """The exact silhouette of a mesh: the pixels of the frame whose centres it covers.
+
+    Lens distortion acts on the vertices, so faces should be small. Depths must be positive.
+    """
+    pixels = camera.project(vertices_camera)
+    nothing = np.zeros((len(pixels), 0), np.float32)
+    face, _ = rasterize(
+        pixels, vertices_camera[:, 2], faces, nothing, width=camera.width, height=camera.height
+    )
+    return face >= 0
 
 
 def _still_pose(
