@@ -5,7 +5,7 @@ import os
 import platform
 import shlex
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -78,11 +78,6 @@ class RunInputs:
             if (path := metadata.get(f"{field.name}_path"))
         }
         return cls(**files) if "source" in files else None
-
-    @classmethod
-    def from_facts(cls, facts: Mapping[str, str]) -> "RunInputs | None":
-        """Inputs by metadata or `RunFacts` of any age; of old recordings by `from_command`."""
-        return cls.from_metadata(facts) or cls.from_command(facts["command"])
 
     @classmethod
     def from_command(cls, command: str) -> "RunInputs | None":
@@ -278,11 +273,6 @@ def _header(of_run: tuple[tuple[str, str], ...], files: tuple[tuple[str, bytes],
     if recorded is not None and recorded != str(_checksum(attachments)):
         raise RecordingError("its config, template or calibration is damaged or missing")
     return header
-
-
-def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
-    """The runs of several segments, each once, by their frames."""
-    return tuple(sorted({run for header in headers for run in header.runs}))
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:

@@ -14,7 +14,7 @@ from stream_dmr.files import natural_order
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import Frame, LearntShapes, LocalizedFish, Message
 from stream_dmr.recording.codec import decode_selected
-from stream_dmr.recording.header import RunHeader, joined_runs
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.rerun.rrd_file import RrdRecording
@@ -149,8 +149,8 @@ class _Segments:
 
     def __init__(self, segments: Sequence[Recording]) -> None:
         self._segments = segments
-        runs = joined_runs(segment.header for segment in segments)
-        self.header = replace(segments[-1].header, runs=runs)
+        runs = {run for segment in segments for run in segment.header.runs}
+        self.header = replace(segments[-1].header, runs=tuple(sorted(runs)))
         self.metadata = segments[0].metadata
         self.ends_early = any(segment.ends_early for segment in segments)
         self.is_thinned = any(segment.is_thinned for segment in segments)

@@ -84,13 +84,11 @@ TOPICS: Topics = {
     )
 }
 
-
 SECOND_TOPICS: Topics = {
     kind: replace(TOPICS[kind], topic=f"/second{TOPICS[kind].topic}")
     for kind in (Frame, FishCrop, FittedMesh, LocalizedFish)
 }
 """Topics of the second camera's messages in a recording of two cameras."""
-
 
 CARRIED_OVER = "/carried/localized"
 """In a segment: the LocalizedFish from before it of the tracks that were open when it began."""
@@ -105,17 +103,6 @@ FOXGLOVE_TOPICS = {
     "/foxglove/position": "foxglove.LocationFix",
 }
 """Topic -> schema, in the .mcap with `foxglove = true`."""
-
-
-def topics_table() -> str:
-    """The Markdown tables of topics in `docs/files.md`."""
-    lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
-    for row in TOPICS.values():
-        entities = ", ".join(f"`{path}`" for path in row.entities)
-        lines.append(f"| `{row.message.__name__}` | `{row.topic}` | `{row.schema}` | {entities} |")
-    lines += ["", "| topic with `foxglove = true` | schema |", "|---|---|"]
-    lines += [f"| `{topic}` | `{schema}` |" for topic, schema in FOXGLOVE_TOPICS.items()]
-    return "\n".join(lines)
 
 
 class RecordingSettings(Settings):

@@ -309,7 +309,7 @@ def assigns_ids(folder: Path) -> bool:
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)
     texts = [{k: v for k, v in asdict(f).items() if isinstance(v, str)} for f in runs.values()]
-    given = [RunInputs.from_facts(facts) for facts in texts]
+    given = [RunInputs.from_metadata(t) or RunInputs.from_command(t["command"]) for t in texts]
     return any(inputs is not None and not (inputs.boxes or inputs.masks) for inputs in given)
 
 

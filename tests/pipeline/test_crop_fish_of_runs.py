@@ -13,7 +13,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.replay_inputs import read_inputs
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import CropFishOfRuns
-from stream_dmr.recording.header import RunHeader, RunStart, joined_runs
+from stream_dmr.recording.header import RunHeader, RunStart
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import open_recordings
 from tests.support.fish_run import StopAt
@@ -98,9 +98,11 @@ def test_runs_whose_beginnings_are_not_known_are_said(
     assert any("do not record at which frame" in line for line in observer.warned) is is_said
 
 
-def test_the_runs_of_segments_are_joined_by_their_frames_and_come_back():
-    segments = [replace(header(), runs=(run,)) for run in (LATER, FIRST, SECOND, FIRST)]
-    runs = joined_runs(segments)
+def test_the_runs_of_segments_are_joined_by_their_frames_and_come_back(tmp_path: Path):
+    for number, run in enumerate((LATER, FIRST, SECOND, FIRST)):
+        segment = replace(header(), runs=(run,))
+        McapSink(tmp_path / f"recording-{number:06d}.mcap", segment, flush_s=1.0).close()
+    runs = open_recordings([tmp_path]).header.runs
     assert runs == (FIRST, SECOND, LATER)
     one = replace(header(), runs=runs)
     assert RunHeader.from_parts(one.metadata(), one.attachments()).runs == runs

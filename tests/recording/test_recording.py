@@ -37,9 +37,10 @@ from stream_dmr.recording.record import SinkFactory
 from stream_dmr.recording.recorder import Recorder, open_recording_files
 from stream_dmr.recording.repair import repair_recordings
 from stream_dmr.recording.segments import open_segments
-from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, RecordingSettings, topics_table
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import bend_along, place_fit
 from stream_dmr.store.run_tables import FramesTable
+from tests.support.pages import topics_table
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
 from tests.support.small_disk import file_size_limit

@@ -281,7 +281,6 @@ def test_a_live_view_never_waits(monkeypatch: pytest.MonkeyPatch):
     for _ in range(50):
         for message in messages:
             view.write(make_record(message, RecordingSettings()))
-    assert view.num_dropped > 0
     began = time.monotonic()
     view.close()
     assert time.monotonic() - began < 30

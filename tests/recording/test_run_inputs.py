@@ -33,7 +33,7 @@ def test_a_recording_without_them_has_none():
     ],
 )
 def test_an_old_recording_s_command_names_them(command, source, boxes):
-    inputs = RunInputs.from_facts({"command": command})
+    inputs = RunInputs.from_command(command)
     assert inputs is not None
     assert inputs.source == InputFile(path=source)
     assert inputs.boxes == (None if boxes is None else InputFile(path=boxes))
@@ -41,7 +41,7 @@ def test_an_old_recording_s_command_names_them(command, source, boxes):
 
 @pytest.mark.parametrize("command", ["", "stream-dmr replay --source x", "run", "run 'unclosed"])
 def test_other_commands_name_none(command):
-    assert RunInputs.from_facts({"command": command}) is None
+    assert RunInputs.from_command(command) is None
 
 
 def test_a_file_is_unchanged_until_its_content_changes(tmp_path: Path, monkeypatch):

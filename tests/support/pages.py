@@ -14,7 +14,7 @@ from typing import Any
 from stream_dmr import messages
 from stream_dmr.pipeline.config import Config
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.topics import topics_table
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS
 from stream_dmr.store.run_tables import FishRow, FrameRow
 from tests.support.plan import draw_plan, read_plan
 
@@ -55,6 +55,17 @@ def _allowed(setting: dict[str, Any]) -> str:
 def files_tables() -> str:
     """Topics, schemas and entities, then the fields of every message."""
     return "\n".join([topics_table() + "\n", *_message_tables()])
+
+
+def topics_table() -> str:
+    """The Markdown tables of topics in `docs/files.md`."""
+    lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
+    for row in TOPICS.values():
+        entities = ", ".join(f"`{path}`" for path in row.entities)
+        lines.append(f"| `{row.message.__name__}` | `{row.topic}` | `{row.schema}` | {entities} |")
+    lines += ["", "| topic with `foxglove = true` | schema |", "|---|---|"]
+    lines += [f"| `{topic}` | `{schema}` |" for topic, schema in FOXGLOVE_TOPICS.items()]
+    return "\n".join(lines)
 
 
 def _message_tables() -> Iterator[str]:

@@ -146,7 +146,7 @@ def _scene_view(
 
 
 def log_camera(
-    rec: rr.RecordingStream, camera: Camera, place: str = CAMERA, *, depth: float, factor: int
+    rec: rr.RecordingStream, camera: Camera, place: str, *, depth: float, factor: int
 ) -> None:
     """Log the camera, static, for fish at a depth of some `depth` (mm, or body lengths).
 

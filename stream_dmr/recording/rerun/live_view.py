@@ -32,7 +32,6 @@ class LiveView:
     name = "live view"
 
     def __init__(self, header: RunHeader, settings: RecordingSettings) -> None:
-        self.num_dropped = 0
         self._queue: Queue[Record] = Queue(_MAX_QUEUED)
         self._stop = Event()
         port = _free_port()
@@ -46,10 +45,8 @@ class LiveView:
 
     def write(self, record: Record) -> None:
         """Show a record if the queue has room for it."""
-        try:
+        with suppress(Full):
             self._queue.put_nowait(record)
-        except Full:
-            self.num_dropped += 1
 
     def close(self) -> None:
         self._stop.set()
