@@ -139,13 +139,7 @@ def fleet(
     """
     from stream_dmr.evidence.own_files import is_made_by, require_writable
     from stream_dmr.files import replace_text
-    from stream_dmr.web.fleet_page import (
-        ask_all,
-        fleet_page,
-        load_boxes,
-        read_memory,
-        write_memory,
-    )
+    from stream_dmr.web.fleet_page import ask_all, fleet_page, load_boxes, read_memory, write_memory
 
     memory = out.with_suffix(".json")
     if memory == out:
@@ -157,7 +151,7 @@ def fleet(
         while not stop.is_set():
             began_s = time.monotonic()
             states = ask_all(states)
-            page = fleet_page(states, title="Fleet", every_s=every, now_ns=time.time_ns())
+            page = fleet_page(states, every_s=every, now_ns=time.time_ns())
             write_memory(memory, states)
             replace_text(out, page)
             _print_changes(states, printed)

@@ -76,7 +76,8 @@ class AlertSender:
         seen, num_equal = list[str](), 0
         while not self._ended.wait(self._look_s):
             problems = list(self._problems())
-            kinds = _kinds(problems)
+            # Without their figures, which change from check to check.
+            kinds = sorted({re.sub(r"\d+", "#", problem) for problem in problems})
             num_equal, seen = (num_equal + 1 if kinds == seen else 1), kinds
             if num_equal >= _SETTLE_LOOKS:
                 self._send(problems, kinds)
@@ -112,11 +113,6 @@ class AlertSender:
                 self._on_notice(line)
             return False
         return True
-
-
-def _kinds(problems: Sequence[str]) -> list[str]:
-    """Problems without their figures, which change from check to check."""
-    return sorted({re.sub(r"\d+", "#", problem) for problem in problems})
 
 
 def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:

@@ -37,7 +37,6 @@ _MAX_WARNINGS = 5  # shown of each box, the latest
 _WARNING_AGE_S = 86_400.0  # older warnings are history
 _MAX_DIGEST_AGE = timedelta(days=2)  # yesterday's digest comes today
 
-
 _WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
 _SUMMARY = {"healthy": "measuring", "unhealthy": "with a problem", "silent": "silent"}
 _ORDER = tuple(reversed(_WORDS))  # boxes with problems come first
@@ -340,12 +339,11 @@ def write_memory(path: Path, states: Iterable[BoxState]) -> None:
     replace_text(path, _Kept(boxes=kept).model_dump_json(indent=1))
 
 
-def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:
+def fleet_page(states: Sequence[BoxState], *, every_s: float, now_ns: int) -> str:
     """The HTML of the page; if `every_s` is above 0, browsers reload it at that interval."""
     ordered = sorted(states, key=lambda state: (_ORDER.index(state.kind), state.box.name))
     return render(
         "watch/fleet.html",
-        title=title,
         states=ordered,
         summary=f"{fleet_summary(states)}; written {minute_text(now_ns)}",
         every_s=every_s,

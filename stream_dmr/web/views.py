@@ -224,9 +224,6 @@ class DrawnView:
     midline: Float[np.ndarray, "M 3"]
 
 
-DrawnViews = Mapping[int, list[DrawnView]]  # track id -> its best views, the best first
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnFish:
     """All frames of a fish, and its best views; empty where nothing of it was read."""
@@ -257,8 +254,8 @@ def draw_views(
     source: str | None = None,
     *,
     pictures: FrameLookup | None = None,
-) -> DrawnViews:
-    """Draw the views of all tracks, with the pictures of `source` or of the recording.
+) -> Mapping[int, list[DrawnView]]:
+    """Draw the views of all tracks, the best first, with pictures of `source` or the recording.
 
     Without `source`, the recorded source is tried. `pictures` replaces both: it finds a frame
     without reading all frames before it, as is done for a recorded video. Fish without a picture

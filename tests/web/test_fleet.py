@@ -100,7 +100,7 @@ def test_the_token_is_sent_and_never_written(state: RunState, tmp_path: Path):
     assert with_it.kind == "healthy"
     assert "asks for a token" in without.error
     write_memory(tmp_path / "fleet.json", [with_it])
-    page = fleet_page([with_it, without], title="Fleet", every_s=0.0, now_ns=0)
+    page = fleet_page([with_it, without], every_s=0.0, now_ns=0)
     assert TOKEN not in page + (tmp_path / "fleet.json").read_text() + repr(with_it)
 
 
@@ -208,7 +208,7 @@ def test_a_browser_shows_every_box_at_any_width(state: RunState, tmp_path: Path)
         boxes = [Box(name=f"FV {i} <i>", address=address) for i, address in enumerate(addresses)]
         states = ask(*boxes, Box(name="FV gone", address=f"http://127.0.0.1:{free_port()}/"))
     page = tmp_path / "fleet.html"
-    page.write_text(fleet_page(states, title="Fleet", every_s=60.0, now_ns=1))
+    page.write_text(fleet_page(states, every_s=60.0, now_ns=1))
     for width in (390, 800, 961, 1400):
         tab = Tab(page.as_uri(), width=width, height=900)
         try:
