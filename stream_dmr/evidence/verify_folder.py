@@ -35,11 +35,7 @@ from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, track_of
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.mcap.mcap_recording import is_torn
-from stream_dmr.recording.reading import (
-    Recording,
-    messages_of,
-    open_recordings,
-)
+from stream_dmr.recording.reading import Recording, messages_of, open_recordings
 from stream_dmr.recording.repair import DAMAGED
 from stream_dmr.recording.selection import Selection
 from stream_dmr.recording.topics import TOPICS
@@ -83,7 +79,6 @@ from stream_dmr.tables import rotated_files
 
 Row = Mapping[str, Any]
 _NOT_COMPUTED = ("flags",)
-
 
 T = TypeVar("T")
 

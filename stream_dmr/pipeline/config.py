@@ -366,7 +366,6 @@ _STILLS: dict[str, dict[str, Any]] = {
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
 }
 
-
 # Settings for fish placed by two cameras, without the slant by which all frames err alike. Chosen
 # on simulated pairs (docs/two-cameras.md): intervals are still too wide rather than too narrow.
 _BY_TWO: dict[str, dict[str, Any]] = {

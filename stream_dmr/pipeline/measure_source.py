@@ -26,12 +26,7 @@ from stream_dmr.pipeline.learn_shapes import (
     with_learnt_shapes,
 )
 from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
-from stream_dmr.pipeline.run_folder import (
-    AGAIN,
-    prepare_folder,
-    remove_unfinished,
-    result_names,
-)
+from stream_dmr.pipeline.run_folder import AGAIN, prepare_folder, remove_unfinished, result_names
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
 from stream_dmr.pipeline.run_options import RunOptions

@@ -15,7 +15,6 @@ from stream_dmr.recording.selection import EVERYTHING, Selection
 Stage = Literal["crop", "fit", "localize", "smooth"]
 """A stage that a replay may begin with; see `STAGES` of session.py."""
 
-
 TemplateOption = Annotated[
     str,
     "auto: the shape of the fish themselves. Or the body form that they probably have (halibut, "
