@@ -274,10 +274,7 @@ def frames_sha256(frames: Sequence[AddedFrame]) -> str:
 
 
 def add_verdict(
-    path: Path,
-    *verdicts: Verdict,
-    frames: Sequence[AddedFrame] = (),
-    known: int | None = None,
+    path: Path, *verdicts: Verdict, frames: Sequence[AddedFrame] = (), known: int | None = None
 ) -> Verdict:
     """Write verdicts into a lengths.db, durably, all or none; returns the last with its time.
 
