@@ -87,23 +87,19 @@ class Signer:
         return self.content(kind, name, content_sha256(values)) if self._key else []
 
     def content(self, kind: str, name: str, sha256: str) -> list[Statement]:
-        return [insertion(LEDGER, asdict(self.sign(kind, name, sha256)))] if self._key else []
-
-    def sign(self, kind: str, name: str, content_sha256: str) -> ChainEntry:
-        """The next entry. Raises ValueError without a key."""
         if self._key is None:
-            raise ValueError("expected a device key to sign with, got none")
+            return []
         unsigned = ChainEntry(
             number=1 if self._last is None else self._last.number + 1,
             previous="" if self._last is None else self._last.sha256,
             kind=kind,
             name=name,
-            content_sha256=content_sha256,
+            content_sha256=sha256,
             time_ns=time.time_ns(),
         )
         signature = b64encode(self._key.sign(unsigned.signed_bytes)).decode()
         self._last = replace(unsigned, signature=signature)
-        return self._last
+        return [insertion(LEDGER, asdict(self._last))]
 
     def sign_bytes(self, data: bytes) -> bytes:
         """A signature of something that is in no chain; b"" without a key."""

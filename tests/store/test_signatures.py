@@ -124,10 +124,12 @@ def numbered_anew(folder: Path, key: Path) -> None:
 def signed_anew(folder: Path, key: Path) -> None:
     """The whole chain made again with another key, over a changed fish."""
     execute(folder, "UPDATE fish SET length_mm = 999.5 WHERE track_id = 2")
-    signer = Signer(key.with_name("other"))
-    write_entries(
-        folder, [signer.sign(e.kind, e.name, e.content_sha256) for e in entries_of(folder)]
-    )
+    signer, entries = Signer(key.with_name("other")), entries_of(folder)
+    with closing(sqlite3.connect(folder / "lengths.db")) as database, database:
+        database.execute("DELETE FROM chain")
+        for entry in entries:
+            for statement in signer.content(entry.kind, entry.name, entry.content_sha256):
+                database.execute(*statement)
 
 
 def hash_put_right(folder: Path, key: Path) -> None:
