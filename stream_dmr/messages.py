@@ -78,6 +78,9 @@ class CropQuality:
     # Probability that the mask lacks snout or tail, by a network; 1 if another fish may hide one;
     # None: not judged.
     missing_end: float | None = None
+    # Width of the edge at the ends, beyond that along the sides, over the length, as of a fish that
+    # moves while the shutter is open; None: a still, or edges without contrast.
+    end_blur: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -189,6 +192,7 @@ class LocalizedFish(FishMessage):
     # exactly, and how far it hangs from the plane. None: an older recording.
     shared_std_ratio: float | None = None
     species: Mapping[str, float] = field(default_factory=dict[str, float])  # FishCrop's
+    end_blur: float | None = None  # CropQuality's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -240,6 +244,8 @@ class LengthEstimate(FishMessage):
     # FAO 3-alpha of the species, or "unsure"; None until final, and without a classifier's look.
     species_code: str | None = None
     species_share: float | None = None  # posterior probability of the likeliest species
+    # Std over length, since its ends are blurred by its motion; it only seems longer by that.
+    blur_std_ratio: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

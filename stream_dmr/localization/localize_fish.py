@@ -351,5 +351,6 @@ def _message(
         accepted=not reason,
         reason=reason or "",
         shared_std_ratio=None if location is None else location.shared_std_ratio,
+        end_blur=mesh.quality.end_blur,
         species=mesh.species,
     )

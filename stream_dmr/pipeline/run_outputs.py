@@ -45,7 +45,7 @@ from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
-from stream_dmr.store.schema import INTERRUPTED, POSITIONS
+from stream_dmr.store.schema import INTERRUPTED, POSITIONS, flags_of
 from stream_dmr.store.trip import KeptPosition, PositionThinner, position_values
 
 _SENSORS = SensorsSettings()
@@ -196,6 +196,7 @@ class ResultWriter:
         is_in_view = gone is None or (bool(self._in_chain) and gone > self._in_chain[0][0])
         if is_in_view and (flag := self._flag_at_end()) and flag not in flags:
             flags.append(flag)
+        flags += [flag for flag in flags_of(estimate) if flag not in flags]
         self._take_fish(estimate)
         self._store.add(estimate, iou=iou, flags=flags)
 

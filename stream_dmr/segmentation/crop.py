@@ -20,6 +20,7 @@ from stream_dmr.segmentation.crop_geometry import (
     box_in_crop,
     camera_around,
     clean_mask,
+    end_blur,
     frame_from_crop_map,
     glare,
     is_rectangle,
@@ -405,6 +406,7 @@ def crop_fish(
             glare=glare(crop.image, crop.mask),
             length_doubt=crop.length_doubt,
             missing_end=missing_end(crop.image, crop.mask) if is_judged else None,
+            end_blur=None if settings.second_look else end_blur(crop.image, crop.mask),
         ),
         ends=crop.ends,
     )

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from numpy.lib.stride_tricks import sliding_window_view
 
 from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
-from stream_dmr.geometry import components, oriented_extent
+from stream_dmr.geometry import components, long_axis, oriented_extent
 from stream_dmr.messages import FishCrop
 
 _MAX_SAMPLES = 4  # per crop pixel and axis; more changed no mask in tests and cost time
@@ -180,6 +181,69 @@ def sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) 
         return 0.0
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var())
+
+
+# In crop pixels: steps and reach of the profiles across the outline, what is inside and outside in
+# them, and outline points whose profiles are averaged to each side. Chosen.
+_PROFILE_PX = np.arange(-14, 14.5, 0.5)
+_FLAT_STEPS, _BESIDE = 8, 3
+_LEAST_CONTRAST = 25.0  # levels, of the colours inside and outside
+_RISE = 0.2  # share of the contrast at which an edge begins, and before its end
+_FACING, _ALONG = 0.85, 0.35  # cosine between outline's normal and body: ends above, sides below
+_FEWEST_ENDS, _FEWEST_SIDES = 5, 8  # outline points
+
+
+def end_blur(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float | None:
+    """How much wider the edge is at the ends of a fish than along its sides, over its length.
+
+    What moves along its length while the shutter is open has such ends. None: there are too few
+    edges with contrast.
+    """
+    outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not outlines:
+        return None
+    points = max(outlines, key=cv2.contourArea)[::2, 0].astype(np.float64)
+    if len(points) < 2 * _BESIDE + _FEWEST_ENDS + _FEWEST_SIDES:
+        return None
+    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 3)
+    x, y = points.astype(int).T
+    normals = -np.column_stack(
+        [cv2.Sobel(smooth, cv2.CV_32F, *order)[y, x] for order in ((1, 0), (0, 1))]
+    )
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    places = (points[:, None] + _PROFILE_PX[:, None] * normals[:, None]).astype(np.float32)
+    profiles = cv2.remap(
+        image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float32)
+    ring = np.concatenate([profiles[-_BESIDE:], profiles, profiles[:_BESIDE]])
+    profiles = sliding_window_view(ring, 2 * _BESIDE + 1, axis=0).mean(axis=-1)
+    contrast = profiles[:, -_FLAT_STEPS:].mean(axis=1) - profiles[:, :_FLAT_STEPS].mean(axis=1)
+    levels = np.linalg.norm(contrast, axis=1)
+    length_px = float(np.ptp(points @ (axis := long_axis(points))))
+    facing = np.abs(normals @ axis)
+    is_end, is_side = (
+        is_part & (levels > _LEAST_CONTRAST) for is_part in (facing > _FACING, facing < _ALONG)
+    )
+    if is_end.sum() < _FEWEST_ENDS or is_side.sum() < _FEWEST_SIDES:
+        return None
+    along = (profiles * contrast[:, None]).sum(axis=2)  # from the inside's colour to the outside's
+    widths_px = _rise_px(along)
+    ends_px, sides_px = np.median(widths_px[is_end]), np.median(widths_px[is_side])
+    return math.sqrt(max(ends_px**2 - sides_px**2, 0.0)) / max(length_px, 1.0)
+
+
+def _rise_px(profiles: Float[np.ndarray, "N T"]) -> Float[np.ndarray, "N"]:
+    """The way of each profile from its level inside to that outside, as of a straight rise."""
+    inside, outside = (
+        part.mean(axis=1, keepdims=True)
+        for part in (profiles[:, :_FLAT_STEPS], profiles[:, -_FLAT_STEPS:])
+    )
+    share = (profiles - inside) / np.maximum(outside - inside, 1e-6)
+    step = np.arange(profiles.shape[1])
+    middle = np.abs(share - 0.5).argmin(axis=1)[:, None]
+    begin = np.where((share <= _RISE) & (step <= middle), step, 0).max(axis=1)
+    end = np.where((share >= 1 - _RISE) & (step >= middle), step, step[-1]).min(axis=1)
+    return (end - begin) * (_PROFILE_PX[1] - _PROFILE_PX[0]) / (1 - 2 * _RISE)
 
 
 # Share of the smallest rectangle around a mask. Paper labels fill .85 to .90; of 30,000 masks of

@@ -36,7 +36,8 @@ class FishRow:
     first_time: float  # capture times, s (cameras: since 1970), exact to the nanosecond
     last_time: float
     # `measured`, or [why there is no length](troubleshooting.md#reasons); with `; may count twice`
-    # for a fish that was in view at a crash, `; cut off` at a stop or at damage of the source
+    # for a fish that was in view at a crash, `; cut off` at a stop or at damage of the source,
+    # `; blurred` for one that moved while the shutter was open
     status: str
 
 

@@ -490,11 +490,22 @@ CUT_OFF = "cut off"
 # Flags of a fish that was in view at an end other than the source's.
 CUT_OFF_BY_STOP = f"{CUT_OFF}: in view when the run was stopped"
 CUT_OFF_BY_SOURCE = f"{CUT_OFF}: in view where the source is damaged or cut off"
+BLURRED = "blurred"
+_MIN_BLUR_STD = 0.015  # of the length, from which on it is said; chosen
+
+
+def flags_of(estimate: LengthEstimate) -> list[str]:
+    """The flags that an estimate itself has."""
+    if estimate.length_mm is None or estimate.blur_std_ratio < _MIN_BLUR_STD:
+        return []
+    return [f"{BLURRED}: it moved while the shutter was open, and may be shorter"]
 
 
 def flags_in_status(flags: Iterable[str]) -> str:
     """The text of flags beside the status in tables of fish, such as `; cut off`."""
-    shown = [name for name in (MAY_COUNT_TWICE, CUT_OFF) if any(name in flag for flag in flags)]
+    shown = [
+        name for name in (MAY_COUNT_TWICE, CUT_OFF, BLURRED) if any(name in flag for flag in flags)
+    ]
     return "".join(f"; {name}" for name in shown)
 
 

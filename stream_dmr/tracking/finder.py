@@ -291,7 +291,7 @@ class TrackedFish:
         )
 
     def _repeats_the_last(self, frame: Frame) -> bool:
-        """True if a picture of a video is none of its own; boxes of a file are for every picture."""
+        """True for a picture of a video that is none of its own; boxes of a file are for each."""
         return (
             self._settings.across_frames
             and not isinstance(self._detector, BoxDetector)

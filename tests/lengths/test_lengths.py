@@ -17,6 +17,7 @@ from stream_dmr.lengths.kalman import (
 from stream_dmr.lengths.track_record import TrackLength, late_estimate, measurement_of
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.reasons import Reason
+from stream_dmr.store.schema import flags_of
 
 seeds = st.integers(0, 2**32 - 1)
 OPEN_GATE = 1 - 1e-15
@@ -366,6 +367,39 @@ def test_what_is_not_known_of_the_shape_widens_the_interval_however_many_frames(
     assert unknown.length_mm == known.length_mm
     added = unknown.length_std_mm**2 - known.length_std_mm**2
     assert added == pytest.approx((0.03 * 700.0) ** 2, rel=1e-9)
+
+
+def hauled(blurs, *, way_px=15.0):
+    """Frames of a fish of 100 px that goes so far from one to the next."""
+    ends_px = np.array([[0.0, 0.0], [0.0, 50.0], [0.0, 100.0]])
+    return [
+        replace(frame(i, 700.0), end_blur=blur, keypoints_px=ends_px - [0.0, way_px * i])
+        for i, blur in enumerate(blurs, start=1)
+    ]
+
+
+def test_a_blurred_fish_may_be_shorter_but_not_longer():
+    sharp, blurred = (run(hauled([blur] * 9))[-1] for blur in (0.0, 0.06))
+    assert blurred.length_mm == sharp.length_mm
+    assert blurred.ci95_mm[1] == pytest.approx(sharp.ci95_mm[1])
+    assert blurred.ci95_mm[0] < sharp.ci95_mm[0] - 0.04 * 700.0
+    assert blurred.length_std_mm > sharp.length_std_mm
+    assert sharp.blur_std_ratio == 0.0 < blurred.blur_std_ratio
+    assert not flags_of(sharp)
+    assert flags_of(blurred)
+
+
+@pytest.mark.parametrize(
+    ("blurs", "way_px"),
+    [
+        ([0.06] * 9, 1.0),  # it hardly moves: its tail fin is translucent
+        ([0.0, 0.0, 0.3] * 3, 15.0),  # an end behind something, in some frames
+        ([None] * 9, 15.0),
+        ([0.06] * 2, 15.0),
+    ],
+)
+def test_what_is_no_motion_or_not_in_most_frames_is_no_blur(blurs, way_px):
+    assert run(hauled(blurs, way_px=way_px))[-1].blur_std_ratio == 0.0
 
 
 def test_frames_of_before_say_nothing_of_the_shape():
