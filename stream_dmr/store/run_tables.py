@@ -37,7 +37,7 @@ class FishRow:
     last_time: float
     # `measured`, or [why there is no length](troubleshooting.md#reasons); with `; may count twice`
     # for a fish that was in view at a crash, `; cut off` at a stop or at damage of the source,
-    # `; blurred` for one that moved while the shutter was open
+    # `; blurred` for one whose ends are, as by a long exposure
     status: str
 
 

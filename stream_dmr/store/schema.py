@@ -498,7 +498,7 @@ def flags_of(estimate: LengthEstimate) -> list[str]:
     """The flags that an estimate itself has."""
     if estimate.length_mm is None or estimate.blur_std_ratio < _MIN_BLUR_STD:
         return []
-    return [f"{BLURRED}: it moved while the shutter was open, and may be shorter"]
+    return [f"{BLURRED}: its ends are, as by a long exposure, and it may be shorter"]
 
 
 def flags_in_status(flags: Iterable[str]) -> str:

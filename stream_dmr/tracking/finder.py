@@ -35,6 +35,7 @@ from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.tracking.box_correction import BoxCorrector
 from stream_dmr.tracking.confirmation import ConfirmationSettings, FishConfirmation, FishEvidence
+from stream_dmr.tracking.track import TrackedCandidate
 from stream_dmr.tracking.tracker import Tracker, TrackerSettings
 
 
@@ -224,7 +225,8 @@ class TrackedFish:
         self._tracker = Tracker(settings)
         self._confirmation = FishConfirmation(settings)
         self._corrector = BoxCorrector()
-        self._repeats, self._is_repeat = Repeats(), False  # the latter of the last frame
+        self._repeats = Repeats()
+        self._tracked: list[TrackedCandidate] = []  # in the last frame
         self._settings = settings
         self._seen = Sightings()
         # Single pictures in which a detector's boxes are all that speaks for a fish.
@@ -235,27 +237,10 @@ class TrackedFish:
         self._name = ""  # of the last picture
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """All tracks seen in a frame, by track number. Frames must come in order.
-
-        None in a picture that repeats the one before: its fish neither rest nor are seen once more.
-        """
-        self._name, self._is_repeat = frame.source, False
+        """All tracks seen in a frame, by track number. Frames must come in order."""
+        self._name = frame.source
         self._seen.frames += 1
-        if self._are_stills and not self.has_masks:
-            candidates = find_in_still(self._detector, frame)
-        elif self._passes_over(frame):
-            candidates = []
-        elif self._repeats_the_last(frame):
-            self._is_repeat = True
-            return []
-        else:
-            candidates = self._detector.find(frame)
-        tracked = self._tracker.step(frame, candidates)
-        self._seen.candidates += len(candidates)
-        scores = [candidate.score for candidate in candidates]
-        self._seen.best_score = max([self._seen.best_score, *scores])
-        if self.has_masks:
-            tracked = [fish for fish in tracked if fish.candidate.foreground is not None]
+        tracked = self._tracked = self._follow(frame)
         boxes = {fish.track_number: fish.candidate.bbox_xyxy_px for fish in tracked}
         visible = {fish.track_number: fish.visible_fraction for fish in tracked}
         self._evidence = {fish.track_number: fish.evidence for fish in tracked}
@@ -282,6 +267,27 @@ class TrackedFish:
             for detection in self._corrector.correct(due, visible, frame)
         ]
 
+    def _follow(self, frame: Frame) -> list[TrackedCandidate]:
+        """The tracks seen in a frame.
+
+        A picture that repeats the one before shows the same: its fish do not rest.
+        """
+        if self._are_stills and not self.has_masks:
+            candidates = find_in_still(self._detector, frame)
+        elif self._passes_over(frame):
+            candidates = []
+        elif self._repeats_the_last(frame):
+            return self._tracked
+        else:
+            candidates = self._detector.find(frame)
+        tracked = self._tracker.step(frame, candidates)
+        self._seen.candidates += len(candidates)
+        scores = [candidate.score for candidate in candidates]
+        self._seen.best_score = max([self._seen.best_score, *scores])
+        if self.has_masks:
+            tracked = [fish for fish in tracked if fish.candidate.foreground is not None]
+        return tracked
+
     def _passes_over(self, frame: Frame) -> bool:
         """True if nothing happens in a frame of a video."""
         return (
@@ -291,12 +297,13 @@ class TrackedFish:
         )
 
     def _repeats_the_last(self, frame: Frame) -> bool:
-        """True for a picture of a video that is none of its own; boxes of a file are for each."""
-        return (
-            self._settings.across_frames
-            and not isinstance(self._detector, BoxDetector)
-            and self._repeats.is_repeat(frame)
-        )
+        """True for a picture of a video that is none of its own, while something is followed.
+
+        Boxes of a file are for each picture.
+        """
+        if not self._settings.across_frames or isinstance(self._detector, BoxDetector):
+            return False
+        return self._repeats.is_repeat(frame) and self._tracker.is_following
 
     def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
         """Look closer at some of the moving tracks that do not yet count as fish."""
@@ -334,8 +341,6 @@ class TrackedFish:
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
         """Confirmed fish by track number; `crops` are those of all detections of the frame."""
-        if self._is_repeat:
-            return {}
         self._corrector.update(crops)
         self._confirmation.forget_all_but(self._tracker.open_numbers)
         fish = {

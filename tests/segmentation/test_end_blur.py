@@ -22,7 +22,8 @@ def seen(mask: np.ndarray, *, way_px: float, angle_deg: float, noise: float = 3.
     move = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
     shifts = np.linspace(-0.5, 0.5, 33)[:, None] * way_px * move
     steps = [
-        cv2.warpAffine(body, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (SIZE, SIZE)) for x, y in shifts
+        cv2.warpAffine(body, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (SIZE, SIZE))
+        for x, y in shifts
     ]
     shape = cv2.GaussianBlur(np.mean(steps, axis=0), (0, 0), 1.0)[..., None]
     colour = shape * (190, 200, 210) + (1 - shape) * (90, 80, 60)
