@@ -134,7 +134,7 @@ class Track:
             self._filter.update(observation.center[:, None], R=R)
             return
         if self.frames_seen > 2:  # before, the speed is not known
-            square = self._distance(observation) ** 2
+            square = self.distance(observation) ** 2
             self._mean_square = _MEMORY * self._mean_square + (1 - _MEMORY) * square
         self._whole = observation
         self.was_separate = not observation.is_piece
@@ -188,7 +188,7 @@ class Track:
         if is_only_one:
             way = self.lost_frames * float(np.hypot(*self._filter.x[2:, 0])) / max(self.size, 1.0)
             gate = min(gate + _SPEED_CHANGE * way, _FIRST_GATE)
-        if self._distance(observation) > gate:
+        if self.distance(observation) > gate:
             return IMPOSSIBLE
         offset = observation.center - self.center
         S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
@@ -200,9 +200,10 @@ class Track:
         cost += self._cost_of_colours(observation)
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
-    def _distance(self, observation: Observation) -> float:
-        """Sizes from the predicted place of the fish."""
-        return float(np.hypot(*(observation.center - self.center)) / max(self.size, 1.0))
+    def distance(self, observation: Observation, *, steps: int = 0) -> float:
+        """Sizes from the predicted place of the fish, or from where it is so many steps later."""
+        ahead = self.center + steps * self._filter.x[2:, 0]
+        return float(np.hypot(*(observation.center - ahead)) / max(self.size, 1.0))
 
     @property
     def _gate(self) -> float:

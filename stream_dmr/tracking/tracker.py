@@ -35,6 +35,9 @@ _MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another fish
 _MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
 _KNOWN_STEPS = 31  # frames whose median step is the usual one
 _MAX_STEPS = 60  # that count, where a broken file's times are none
+_LEAST_STEP_NS = 100_000  # a shorter one is no step: times that repeat are 1 ns later. Chosen
+# Sizes within which a fish is seen again where it should be after a gap, or as if there were none.
+_NEAR, _NEAR_NEXT = 0.4, 0.2  # chosen on simulated rails, see docs/research/tracking.md
 _MIN_PAUSE_NS = 2_000_000_000  # chosen: by then another fish may hang in a fish's place
 # An exposure that changes at once changes all colours: the light in which they are compared follows
 # within some thirty frames. A few grey levels of dark water are noise, and say nothing of fish in a
@@ -99,7 +102,7 @@ class Tracker:
             for candidate in candidates
             if candidate.score >= self._settings.min_score
         ]
-        if not self._advance(frame.timestamp_ns) or not self._settings.across_frames:
+        if not self._advance(frame.timestamp_ns, observations) or not self._settings.across_frames:
             self.forget_tracks()
         for track in (*self._tracks, *self._hidden):
             track.predict(self._now)
@@ -127,7 +130,7 @@ class Tracker:
             return frame
         return replace(frame, image=cv2.convertScaleAbs(frame.image, alpha=gain))
 
-    def _advance(self, timestamp_ns: int) -> bool:
+    def _advance(self, timestamp_ns: int, observations: Sequence[Observation]) -> bool:
         """Go on to a frame's time; False after a pause, as of a camera that films what moves.
 
         Pictures that a camera or a network lost leave a gap in the times, not in the indices.
@@ -135,11 +138,25 @@ class Tracker:
         last_ns, self._last_ns = self._last_ns, timestamp_ns
         if last_ns is None:
             return True
-        self._steps_ns.append(timestamp_ns - last_ns)
-        usual_ns = float(np.median(self._steps_ns))
-        self._now += int(np.clip(round(self._steps_ns[-1] / usual_ns), 1, _MAX_STEPS))
-        longest_ns = max(_MIN_PAUSE_NS, (self._settings.max_lost_frames + 1) * usual_ns)
-        return self._steps_ns[-1] <= longest_ns
+        step_ns = timestamp_ns - last_ns
+        before_ns = self._steps_ns[-1] if self._steps_ns else step_ns
+        if step_ns >= _LEAST_STEP_NS:
+            self._steps_ns.append(step_ns)
+        usual_ns = float(np.median(self._steps_ns or [_LEAST_STEP_NS]))
+        steps = int(np.clip(round(step_ns / usual_ns), 1, _MAX_STEPS))
+        if self._num_near(observations, 1, _NEAR_NEXT) > self._num_near(observations, steps, _NEAR):
+            steps = 1  # a picture stands, or the times of clips leave a gap where nothing is lost
+        self._now += steps
+        longest = (self._settings.max_lost_frames + 1) * max(usual_ns, before_ns)
+        return step_ns <= max(_MIN_PAUSE_NS, longest)
+
+    def _num_near(self, observations: Sequence[Observation], steps: int, near: float) -> int:
+        """How many fish of the last frame are seen near where they should be after these steps."""
+        return sum(
+            any(track.distance(seen, steps=steps) < near for seen in observations)
+            for track in self._tracks
+            if track.lost_frames == 0
+        )
 
     def _inside(self, observation: Observation) -> list[Track]:
         """The tracks whose predicted box lies mostly inside an observation's."""

@@ -297,6 +297,35 @@ def test_pictures_that_a_camera_lost_leave_a_gap_in_time_only(lost: int):
     assert numbers == [1] * 16
 
 
+def numbers_at(times_ns: Sequence[int], *, speed: float, moments: Sequence[int]) -> list[int]:
+    """The numbers of a fish that is hauled up, in pictures of these moments and times."""
+    tracker = Tracker(TrackerSettings())
+    numbers = []
+    for index, (moment, time_ns) in enumerate(zip(moments, times_ns, strict=True), start=1):
+        spots = [climbing(moment, speed=speed)]
+        frame = replace(spots_frame(spots, index), timestamp_ns=time_ns)
+        numbers += [seen.track_number for seen in tracker.step(frame, spots_candidates(spots))]
+    return numbers
+
+
+@pytest.mark.parametrize("gap", [6, 12, 25])
+def test_times_of_clips_that_leave_a_gap_lose_no_fish(gap: int):
+    times_ns = [66_666_667 * moment for moment in [*range(8), *range(8 + gap, 16 + gap)]]
+    assert numbers_at(times_ns, speed=20.0, moments=range(16)) == [1] * 16
+
+
+def test_a_fish_keeps_its_number_in_pictures_that_stand():
+    moments = [*range(8), 7, 7, *range(8, 14)]  # of a stand, one picture in 16 is examined
+    times_ns = [66_666_667 * moment for moment in [*range(8), 23, 39, *range(40, 46)]]
+    assert numbers_at(times_ns, speed=15.0, moments=moments) == [1] * 16
+
+
+@pytest.mark.parametrize("times", [2, 3, 16])
+def test_times_that_repeat_are_no_steps(times: int):
+    times_ns = [66_666_667 * (i // times * times) + i % times for i in range(32)]
+    assert numbers_at(times_ns, speed=10.0, moments=range(32)) == [1] * 32
+
+
 def test_ids_count_from_1_and_are_never_given_twice():
     passage = [[climbing(i, speed=30)] for i in range(14)]
     found = ids(follow((passage + [[]] * 10) * 5))
