@@ -371,7 +371,8 @@ class TrackedFish:
     def _without_parts(self, crops: Mapping[int, FishCrop]) -> Collection[int]:
         """The tracks of a film's frame, without those that follow a part of a confirmed fish.
 
-        A fish that rests and moves its head is one fish.
+        A fish that rests and moves its head is one fish. What is not confirmed yet and holds a
+        confirmed fish is no other one either, but glare or a gaff with it, or a mask of both.
         """
         if not self._settings.across_frames or isinstance(self._detector, BoxDetector):
             return crops
@@ -384,6 +385,9 @@ class TrackedFish:
                 share_inside(crop, crops[fish]) > _SAME
                 for fish in sure
                 if fish != track and (track not in sure or area_px[fish] > area_px[track])
+            )
+            and not any(
+                share_inside(crops[fish], crop) > _SAME for fish in sure if track not in sure
             )
         ]
 

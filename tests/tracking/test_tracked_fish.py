@@ -223,6 +223,22 @@ def test_a_picture_shows_no_fish_inside_of_another(across_frames: bool):
     assert len(shown) == 2
 
 
+@pytest.mark.parametrize(("left", "num_fish"), [(50, 1), (120, 2)])
+def test_what_begins_to_be_followed_and_holds_a_fish_is_no_other_fish(left: int, num_fish: int):
+    class Boxes:
+        refused: ClassVar[dict[str, int]] = {}
+
+        def find(self, frame: Frame) -> list[Candidate]:
+            later = [[left, 50, left + 150, 150]] * (frame.frame_index > 2)
+            boxes = np.array([[60, 60, 110, 90], *later], np.float64)
+            return [Candidate(bbox_xyxy_px=box, score=1.0) for box in boxes]
+
+    fish = TrackedFish(Boxes(), TrackFishSettings(min_track_frames=2))
+    for frame in map(marked_frame, range(1, 7)):
+        shown = fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
+    assert list(shown) == list(range(1, num_fish + 1))
+
+
 def test_a_still_shows_no_end_of_a_fish_that_goes_under_another_one():
     class Boxes:
         refused: ClassVar[dict[str, int]] = {}
