@@ -1,5 +1,6 @@
 """Read pictures from files; recognise files that are no pictures, too large, or cut off."""
 
+import io
 import re
 import warnings
 from pathlib import Path
@@ -14,6 +15,7 @@ MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 _ORIENTATION = 0x0112  # the tag of EXIF; 1: as it should be shown
+_TIFF_STARTS = (b"II", b"MM")
 _JPEG_START = b"\xff\xd8"
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
 _JPEG_END = b"\xd9"
@@ -43,15 +45,19 @@ def size_if_huge(path: Path) -> str:
 
 
 def is_turned(path: Path) -> bool:
-    """True for a picture that by its EXIF is not as it should be shown, and can be read so.
+    """True for a picture that by its EXIF is not as it should be shown."""
+    return _orientation(path) != 1
 
-    OpenCV turns a TIFF in any case.
-    """
+
+def _orientation(file: Path | io.BytesIO) -> int:
+    """How a picture is to be turned, by its EXIF; 1, not at all, if that can't be read."""
     try:
-        with Image.open(path) as picture:
-            return picture.format != "TIFF" and picture.getexif().get(_ORIENTATION, 1) != 1
-    except (OSError, ValueError, SyntaxError):
-        return False
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(file) as picture:
+                return picture.getexif().get(_ORIENTATION, 1)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return 1
 
 
 def read_picture(path: Path, flags: int) -> np.ndarray | None:
@@ -65,9 +71,22 @@ def read_picture(path: Path, flags: int) -> np.ndarray | None:
         return None
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:  # OpenCV would print a line for each picture of floats or of 32 bits
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     finally:
         cv2.utils.logging.setLogLevel(level)
+    if picture is None or not flags & cv2.IMREAD_IGNORE_ORIENTATION:
+        return picture
+    return _as_stored(picture, content)
+
+
+def _as_stored(picture: np.ndarray, content: bytes) -> np.ndarray:
+    """A decoded picture without the turn that OpenCV gives a TIFF, whatever the flags."""
+    if not content.startswith(_TIFF_STARTS):
+        return picture
+    turn = _orientation(io.BytesIO(content))
+    upright = picture.swapaxes(0, 1) if turn in (5, 6, 7, 8) else picture
+    down, right = (-1 if turn in turned else 1 for turned in ((3, 4, 6, 7), (2, 3, 7, 8)))
+    return np.ascontiguousarray(upright[::down, ::right])
 
 
 def is_cut_off(content: bytes) -> bool:

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from stream_dmr.errors import SourceError
+from stream_dmr.pictures import read_picture
 from stream_dmr.sources.folders import PictureFolder
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
@@ -85,7 +86,7 @@ def test_12_bits_after_a_picture_of_8_are_not_read_as_night(tmp_path):
     assert [int(f.image.max()) for f in frames] == [100, 255]
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("turn", [3, 6])
 def test_a_picture_is_turned_upright_or_as_the_sensor_saw_it(tmp_path, suffix, turn):
     exif = Image.Exif()
@@ -98,6 +99,17 @@ def test_a_picture_is_turned_upright_or_as_the_sensor_saw_it(tmp_path, suffix, t
     (frame,) = folder
     assert np.abs(frame.image[..., 0].astype(int) - seen).max() < 10
     assert len(folder.warnings) == 1
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_a_tiff_is_read_as_its_sensor_saw_it(tmp_path, turn, kind):
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    seen = noise(1, dtype=kind, channels=1)
+    Image.fromarray(seen).save(tmp_path / "1.tif", exif=exif)
+    picture = read_picture(tmp_path / "1.tif", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(picture, seen)
 
 
 def test_a_picture_that_cannot_be_decoded_keeps_its_index(tmp_path):
