@@ -11,9 +11,11 @@ from stream_dmr.sources.source import ReadFramesSettings
 class ReadFrames:
     """Frames of a source, to be iterated once; `source` has its size, rate and warnings."""
 
-    def __init__(self, source: str, settings: ReadFramesSettings) -> None:
-        """Raises SourceError if nothing can be read from `source`."""
-        self.source = open_source(source, settings)
+    def __init__(
+        self, source: str, settings: ReadFramesSettings, *, size: tuple[int, int] | None = None
+    ) -> None:
+        """See `open_source`. Raises SourceError if nothing can be read from `source`."""
+        self.source = open_source(source, settings, size=size)
         self._frames: Iterable[Frame] = self.source
         self._offset = 0
 

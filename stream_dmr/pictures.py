@@ -33,15 +33,24 @@ def size_if_huge(path: Path) -> str:
     Its pixels alone would take half a gigabyte and more.
     """
     try:
+        width, height = stored_size(path)
+    except Image.DecompressionBombError:
+        return f"more than {MAX_PIXELS // 10**6} megapixels"
+    return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height of a picture by its header, before any turn; (0, 0) if it has none.
+
+    Raises DecompressionBombError for a picture that Pillow finds too large.
+    """
+    try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with open_file(path) as file, Image.open(file) as picture:
-                width, height = picture.size
-    except Image.DecompressionBombError:
-        return f"more than {MAX_PIXELS // 10**6} megapixels"
+                return picture.size
     except (OSError, ValueError, SyntaxError):
-        return ""
-    return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
+        return 0, 0
 
 
 def is_turned(path: Path) -> bool:

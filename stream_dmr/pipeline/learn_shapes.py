@@ -199,7 +199,8 @@ def _first_pass(
     Chain(reader, [crop_fish], on_message=take, on_frame=observer.frame_done, stop=stop).run()
     reader.close()
     if frames is None:
-        reader = ReadFrames(inputs.request.source, config.read_frames)
+        size = inputs.source.width, inputs.source.height
+        reader = ReadFrames(inputs.request.source, config.read_frames, size=size)
     else:
         reader.replace_frames(frames)
     return replace(inputs, reader=reader, crops=crops, kept_frames=frames), crops

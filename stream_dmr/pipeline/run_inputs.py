@@ -170,7 +170,10 @@ def checked_inputs(request: RunOptions) -> Inputs:
         track=config.track_fish,
         pictures=Path(request.source),
     )
-    reader = ReadFrames(request.source, config.read_frames)
+    size = None
+    if calibration is not None:
+        size = calibration.camera.width, calibration.camera.height
+    reader = ReadFrames(request.source, config.read_frames, size=size)
     source = reader.source
     try:
         if calibration is not None:

@@ -118,6 +118,8 @@ def open_pictures(
         with closing(ClipPictures(Path(source), settings)) as pictures:
             yield pictures
     else:
+        # Which sizes the run left out is known from its frames.
+        settings = settings.model_copy(update={"other_sizes": "take"})
         with closing(open_source(source, settings)) as frames:
             is_folder = isinstance(frames, PictureFolder)
             yield SourcePictures(frames.since(first) if is_folder else frames)

@@ -21,6 +21,7 @@ from stream_dmr.pictures import (
     pictures_in,
     read_picture,
     size_if_huge,
+    stored_size,
 )
 from stream_dmr.sources.source import ReadFramesSettings, ResumePoint, Source, nominal_ns
 from stream_dmr.sources.video_file import VideoFile
@@ -45,11 +46,13 @@ class PictureFolder(Source):
         fps: float,
         other_sizes: OtherSizes = "refuse",
         as_sensor: bool = False,
+        size: tuple[int, int] | None = None,
     ) -> None:
         """`other_sizes`: how to treat pictures of another size than the first one's.
 
-        "leave_out" keeps the size that most pictures have. `as_sensor`: pictures are not turned
-        upright, see `[read_frames] orientation`. Raises SourceError if no picture can be decoded.
+        "leave_out" keeps `size`, width and height in px, if any picture has it, else the size that
+        most have. `as_sensor`: pictures are not turned upright, see `[read_frames] orientation`.
+        Raises SourceError if no picture can be decoded.
         """
         self._paths, unreadable = _pictures_in(folder)
         self._is_closed = False
@@ -67,8 +70,10 @@ class PictureFolder(Source):
             )
         self.height, self.width = first.shape[:2]
         if other_sizes == "leave_out":  # the first picture may be of another telephone
-            sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
-            self.height, self.width = max(sizes, key=lambda size: sizes[size])
+            sizes = Counter(p.shape[1::-1] for p in self._sample()) or {first.shape[1::-1]: 1}
+            most = max(sizes, key=lambda size: sizes[size])
+            self.width, self.height = size if size is not None and self._has(size) else most
+        self._others = defaultdict[tuple[int, int], list[str]](list)  # left out, by size
         self._white: int | None = None  # of 16-bit pictures, known from the first one on
 
     def __iter__(self) -> Iterator[Frame]:
@@ -100,10 +105,7 @@ class PictureFolder(Source):
                     'themselves, or set [read_frames] other_sizes to "leave_out" or "take"'
                 )
             if self._other_sizes == "leave_out" and size != (self.width, self.height):
-                self.warnings.append(
-                    f"{path.name}: {size[0]}x{size[1]} px, the calibration is for {self.width}x"
-                    f"{self.height}, so was left out; calibrate its camera and run it by itself"
-                )
+                self._leave_out(path.name, size)
                 continue
             if picture.dtype != np.uint8:  # one factor for the whole folder: it must not flicker
                 self._white = self._white or self._white_of(picture)
@@ -114,6 +116,28 @@ class PictureFolder(Source):
                 image=picture,
                 source=path.name,
             )
+
+    def _has(self, size: tuple[int, int]) -> bool:
+        """True if any picture has a size; those that may have it by their headers are decoded."""
+        for path in self._paths:
+            if not size_if_huge(path) and stored_size(path) in (size, size[::-1]):
+                picture = self._read(path)
+                if picture is not None and picture.shape[1::-1] == size:
+                    return True
+        return False
+
+    def _leave_out(self, name: str, size: tuple[int, int]) -> None:
+        """Name a picture of another size: all of that size in one warning."""
+        before = self._left_out(size)
+        self._others[size].append(name)
+        self.warnings = [line for line in self.warnings if line != before] + [self._left_out(size)]
+
+    def _left_out(self, size: tuple[int, int]) -> str:
+        names = ", ".join(self._others[size])
+        return (
+            f"left out, as the calibration is for pictures of {self.width}x{self.height} px and "
+            f"not of {size[0]}x{size[1]}: {names}; calibrate for these and run them by themselves"
+        )
 
     def _read(self, path: Path) -> np.ndarray | None:
         """The picture as BGR of its own depth; None if it can't be read, or not to its end.

@@ -12,9 +12,12 @@ from stream_dmr.sources.source import ReadFramesSettings, Source
 from stream_dmr.sources.video_file import VideoFile
 
 
-def open_source(source: str, settings: ReadFramesSettings) -> Source:
+def open_source(
+    source: str, settings: ReadFramesSettings, *, size: tuple[int, int] | None = None
+) -> Source:
     """A source by its path, address (`rtsp://...`) or camera index, with its first frame read.
 
+    `size`: the calibration's width and height, px, for a folder of pictures of several sizes.
     Raises SourceError if nothing can be read from it.
     """
     if not source.strip():
@@ -30,6 +33,7 @@ def open_source(source: str, settings: ReadFramesSettings) -> Source:
             fps=settings.images_fps,
             other_sizes=settings.other_sizes,
             as_sensor=settings.orientation == "sensor",
+            size=size,
         )
     if path.exists():
         return VideoFile(path, settings)

@@ -112,7 +112,7 @@ class ReadFramesSettings(Settings):
     other_sizes: Literal["refuse", "leave_out", "take"] = Field(
         default="refuse",
         description="pictures of a folder whose size is not the first one's; --stills takes them "
-        "without a calibration, and with one leaves out those whose size is not that of most",
+        "without a calibration, and with one leaves out those whose size is not the calibration's",
     )
     orientation: Literal["auto", "upright", "sensor"] = Field(
         default="auto",

@@ -1,5 +1,7 @@
 """A folder of pictures as a source: their order, depth, brightness and gaps."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from PIL import Image
 
 from stream_dmr.errors import SourceError
 from stream_dmr.pictures import read_picture
+from stream_dmr.recording.codec import encode, without_picture
+from stream_dmr.recording.frame_images import open_pictures
 from stream_dmr.sources.folders import PictureFolder
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
@@ -161,6 +165,36 @@ def test_the_size_of_most_pictures_counts_where_others_are_left_out(tmp_path):
     folder = PictureFolder(tmp_path, fps=25.0, other_sizes="leave_out")
     assert (folder.width, folder.height) == (30, 20)
     assert [frame.source for frame in folder] == ["1.png", "2.png"]
+
+
+def test_the_size_of_the_calibration_counts_where_any_picture_has_it(tmp_path):
+    for number in range(1, 12):  # none of the two is in the sample
+        size = (30, 20) if number in (2, 5) else (20, 30) if number % 2 else (40, 20)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number, size=size))
+    folder = PictureFolder(tmp_path, fps=25.0, other_sizes="leave_out", size=(30, 20))
+    assert (folder.width, folder.height) == (30, 20)
+    assert [frame.source for frame in folder] == ["2.png", "5.png"]
+    assert [line.split(";")[0] for line in folder.warnings] == [
+        f"left out, as the calibration is for pictures of 30x20 px and not of {others}"
+        for others in (
+            "40x20: 4.png, 6.png, 8.png, 10.png",
+            "20x30: 1.png, 3.png, 7.png, 9.png, 11.png",
+        )
+    ]
+    folder = PictureFolder(tmp_path, fps=25.0, other_sizes="leave_out", size=(30, 40))
+    assert (folder.width, folder.height) == (20, 30)
+
+
+def test_the_pictures_of_a_run_are_found_again_whatever_their_size(tmp_path):
+    for number, size in enumerate([(20, 30), (30, 20), (30, 20)], start=1):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number, size=size))
+    settings = ReadFramesSettings(other_sizes="leave_out")
+    folder = open_source(str(tmp_path), settings, size=(20, 30))
+    (frame,) = folder
+    with open_pictures(str(tmp_path), settings) as pictures:
+        stored = replace(frame, image=np.empty((0, 0, 3), np.uint8))
+        found = pictures.restore(stored, without_picture(encode(frame)))
+    np.testing.assert_array_equal(found.image, frame.image)
 
 
 @pytest.mark.parametrize(("other_sizes", "kept"), [("take", [1, 2, 3]), ("leave_out", [1, 3])])
