@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
 from stream_dmr.camera import Camera
-from stream_dmr.geometry import box_iou, long_axis
+from stream_dmr.geometry import box_iou, long_axis, oriented_extent
 from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.networks.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.segmentation.crop_geometry import (
@@ -194,12 +194,15 @@ def crop_wider(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Maske
     """The crop of a wider box around a crop's mask, segmented again.
 
     The box grows by half its shorter side on each side: by more, a thin fish gets too small to be
-    recognised. A crop with an empty mask is returned as it is.
+    recognised. In stills by half the mask's breadth: a diagonal fish has a square box. A crop with
+    an empty mask is returned as it is.
     """
     if crop.extent is None:
         return crop
     low, high = crop.extent[:2], crop.extent[2:]
     rim = (high - low).min() / 2
+    if view.settings.second_look:
+        rim = (oriented_extent(crop.mask)[0] + 1) * crop.pixel_px / 2
     return _segment(view, np.concatenate([low - rim, high + rim]), segmenter)
 
 
@@ -352,6 +355,8 @@ NOT_NUMBERED = 0  # track ids begin with 1
 # IoU of the masks in a view and in a wider view; masks of simulated fish nearly always agree. See
 # docs/research/tracking.md.
 _MIN_AGREEMENT = 0.4
+# Likewise in stills, whose wider view is less wide; see docs/research/real-pictures.md.
+_MIN_STILL_AGREEMENT = 0.5
 # How far a box extends beyond the ends and the sides of a fish, over its longer side; the least IoU
 # of the masks in both boxes, if they show one fish; the most that the second mask may add to the
 # length and take from the confidence, together. Chosen on photographs that the network never saw,
@@ -426,7 +431,7 @@ def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedC
         return replace(crop, confidence=0.0)
     wider = crop_wider(view, crop, segmenter)
     agreed = agreement(crop, wider)
-    if agreed < _MIN_AGREEMENT:
+    if agreed < (_MIN_STILL_AGREEMENT if view.settings.second_look else _MIN_AGREEMENT):
         return replace(crop, confidence=agreed)
     if not view.settings.second_look or wider.extent is None:
         return crop

@@ -216,10 +216,16 @@ def test_what_looks_alike_in_a_wider_view_keeps_its_confidence(x, y, w, h):
 class Shortsighted(Painter):
     """Takes for fish what is white, unless it sees at least so many px of the frame at once."""
 
+    least = 0.3  # share of the picture that is white
+
     def segment(self, image, bbox_xyxy_px):
         found = super().segment(image, bbox_xyxy_px)
         white = np.count_nonzero(image[..., 0] > 127) / image[..., 0].size
-        return found if white > 0.3 else SegmentedFish(probability=0 * found.probability, ends=None)
+        return (
+            found
+            if white > self.least
+            else SegmentedFish(probability=0 * found.probability, ends=None)
+        )
 
 
 @pytest.mark.parametrize("knows_fish", [True, False])
@@ -244,6 +250,29 @@ def test_what_vanishes_in_a_wider_view_is_doubted_by_a_segmenter_that_knows_fish
     )
     assert crop.mask.any()
     assert (crop.quality.mask_confidence < 0.1) == knows_fish
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, 45, 135])
+def test_a_thin_fish_of_a_still_is_not_too_small_in_the_wider_view_however_it_lies(angle_deg):
+    picture = np.zeros((480, 640), np.uint8)
+    cv2.ellipse(picture, ((320, 240), (260, 60), angle_deg), 255, -1)
+    segmenter = Shortsighted()
+    segmenter.knows_fish, segmenter.least = True, 0.065
+    x, y, w, h = cv2.boundingRect(picture)
+    crop = crop_fish(
+        frame_of(np.repeat(picture[..., None], 3, axis=2)),
+        Detection(
+            source_id=1,
+            bbox_xyxy_px=np.array([x, y, x + w, y + h], np.float64),
+            mask=None,
+            visible_fraction=1.0,
+            may_be_no_fish=True,
+        ),
+        frame_camera=Camera.nominal(width=640, height=480),
+        settings=CropFishSettings(second_look=True),
+        segmenter=segmenter,
+    )
+    assert crop.quality.mask_confidence > 0.9
 
 
 class Obedient(Painter):
