@@ -30,6 +30,7 @@ OtherSizes = Literal["refuse", "leave_out", "take"]
 _DEPTHS = {"uint8", "uint16"}
 # Formats of telephones and cameras that OpenCV does not read.
 _UNREADABLE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"}
+_MAX_NAMED = 20  # pictures of one other size
 
 
 class PictureFolder(Source):
@@ -133,10 +134,11 @@ class PictureFolder(Source):
         self.warnings = [line for line in self.warnings if line != before] + [self._left_out(size)]
 
     def _left_out(self, size: tuple[int, int]) -> str:
-        names = ", ".join(self._others[size])
+        names, more = self._others[size][:_MAX_NAMED], len(self._others[size]) - _MAX_NAMED
+        listed = ", ".join([*names, *([f"{more} more"] if more > 0 else [])])
         return (
             f"left out, as the calibration is for pictures of {self.width}x{self.height} px and "
-            f"not of {size[0]}x{size[1]}: {names}; calibrate for these and run them by themselves"
+            f"not of {size[0]}x{size[1]}: {listed}; calibrate for these and run them by themselves"
         )
 
     def _read(self, path: Path) -> np.ndarray | None:
