@@ -26,8 +26,8 @@ from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts
 # 300 simulated fish, bent severely some of them, none has more than 1.35. One with more swims
 # towards the camera or away, the camera zooms, or the track has gone over to another fish.
 _MAX_DRIFT, _MIN_DRIFT_FRAMES = 1.5, 15
-# Masks hold nearly all that was fish for a part of the exposure: blur of the ends, over the length,
-# from where on it counts; the std of the length over the rest; fewest frames. Chosen on drawn films.
+# Masks hold nearly all that was fish for a part of the exposure. Blur of the ends, over the length,
+# from where on it counts; std of the length over the rest; fewest frames. Chosen on drawn films.
 _SHARP, _BLUR_STD, _MIN_BLUR_FRAMES = 0.025, 3.0, 3
 _CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
