@@ -45,7 +45,7 @@ OPTION = [
 SEEN_S = "seen_s=(self._last.timestamp_ns - self._first.timestamp_ns) / 1e9,"
 COLUMN = [
     Edit("messages.py", "# FAO 3-alpha of", "seen_s: float | None = None\n    ..."),
-    Edit("recording/messages.proto", "species_share = 24;", "...\n  optional double seen_s = 25;"),
+    Edit("recording/messages.proto", "species_share = 24;", "...\n  optional double seen_s = 26;"),
     Edit("lengths/track_record.py", "status=self._status(", f"{SEEN_S}\n            ..."),
     Edit("store/schema.py", "fate TEXT, fate_share REAL", "..., seen_s REAL"),
     Edit(
