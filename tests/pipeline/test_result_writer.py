@@ -14,7 +14,7 @@ from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_tables import LengthsTable
-from stream_dmr.store.schema import INTERRUPTED
+from stream_dmr.store.schema import BLURRED, INTERRUPTED, flags_of
 from tests.support.command import rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
@@ -79,6 +79,16 @@ def test_an_interrupted_fish_is_flagged_and_keeps_its_earlier_frames(opened, tmp
 def test_known_flags_are_kept(opened, tmp_path: Path):
     writer(opened, flags={5: ["the camera seems bumped"]}).write(fish(5))
     assert stored(tmp_path)[5][1] == ["the camera seems bumped"]
+
+
+def test_a_fish_is_flagged_as_blurred_by_its_own_estimate_alone(opened, tmp_path: Path):
+    results = writer(opened, flags={5: [f"{BLURRED}: by earlier settings"], 6: ["bumped"]})
+    results.write(fish(5))
+    results.write(replace(fish(6), blur_std_ratio=0.05))
+    first, second = (stored(tmp_path)[number][1] for number in (5, 6))
+    assert first == []
+    assert second == ["bumped", *flags_of(replace(fish(6), blur_std_ratio=0.05))]
+    assert len(second) == 2
 
 
 @pytest.mark.parametrize(
