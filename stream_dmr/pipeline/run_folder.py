@@ -24,7 +24,7 @@ from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import write_lengths
-from stream_dmr.store.schema import FISH, NAME, column_values, open_for_reading
+from stream_dmr.store.schema import FISH, NAME, column_values, flags_of, open_for_reading
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
@@ -185,7 +185,7 @@ def _add_lengths(path: Path, folder: Path, signer: Signer, stored: set[int]) -> 
     with closing(LengthStore(folder, facts, signer=signer)) as store:
         store.end(f"not by itself: its lengths are {FROM_RECORDING}")
         for estimate in missing:
-            store.add(estimate, flags=[FROM_RECORDING])
+            store.add(estimate, flags=flags_of(estimate, [FROM_RECORDING]))
             stored.add(estimate.track_id)
             yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"
         write_lengths(folder / "lengths.csv", store.estimates(), store.flags())

@@ -45,7 +45,7 @@ from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
-from stream_dmr.store.schema import BLURRED, INTERRUPTED, POSITIONS, flags_of
+from stream_dmr.store.schema import INTERRUPTED, POSITIONS, flags_of
 from stream_dmr.store.trip import KeptPosition, PositionThinner, position_values
 
 _SENSORS = SensorsSettings()
@@ -186,8 +186,7 @@ class ResultWriter:
     def _store_fish(self, estimate: LengthEstimate) -> None:
         ious = self._ious.pop(estimate.track_id, [])
         iou = median(ious) if ious else None
-        known = self._flags.get(estimate.track_id, ())
-        flags = [flag for flag in known if BLURRED not in flag] + flags_of(estimate)
+        flags = [*self._flags.get(estimate.track_id, ())]
         if self._drift is not None:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
@@ -198,7 +197,7 @@ class ResultWriter:
         if is_in_view and (flag := self._flag_at_end()) and flag not in flags:
             flags.append(flag)
         self._take_fish(estimate)
-        self._store.add(estimate, iou=iou, flags=flags)
+        self._store.add(estimate, iou=iou, flags=flags_of(estimate, flags))
 
     def _take_fish(self, estimate: LengthEstimate) -> None:
         if self._hauls is not None:

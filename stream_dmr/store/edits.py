@@ -39,7 +39,7 @@ from stream_dmr.recording.reading import (
     recorded_settings,
 )
 from stream_dmr.recording.selection import EVERYTHING, Selection
-from stream_dmr.store.schema import fish_row
+from stream_dmr.store.schema import fish_row, flags_of
 from stream_dmr.store.verdicts import (
     EDITS,
     AddedFrame,
@@ -259,11 +259,11 @@ def corrected_length(recording: Recording, frames: Mapping[int, LocalizedFish]) 
 def edited_row(
     recording: Recording, frames: Sequence[LocalizedFish], flags: Sequence[str]
 ) -> dict[str, Any]:
-    """The row of `fish` that a run would have written for these frames."""
+    """The row of `fish` that a run would have written for these frames; `flags`: known ones."""
     ious = [fish.iou for fish in frames if fish.accepted and fish.iou is not None]
     settings = settings_of(recording, frames[-1])
     estimate = length_of_frames(frames, settings)[-1]
-    return fish_row(estimate, flags) | {"iou": median(ious) if ious else None}
+    return fish_row(estimate, flags_of(estimate, flags)) | {"iou": median(ious) if ious else None}
 
 
 _STAGES: Mapping[type[Message], str] = {FishCrop: "crop", FittedMesh: "fit", LocalizedFish: "fish"}

@@ -494,11 +494,12 @@ BLURRED = "blurred"
 _MIN_BLUR_STD = 0.015  # of the length, from which on it is said; chosen
 
 
-def flags_of(estimate: LengthEstimate) -> list[str]:
-    """The flags that an estimate itself has."""
+def flags_of(estimate: LengthEstimate, known: Iterable[str] = ()) -> list[str]:
+    """The known flags of a fish, and those of its estimate, which may be another than before."""
+    flags = [flag for flag in known if not flag.startswith(BLURRED)]
     if estimate.length_mm is None or estimate.blur_std_ratio < _MIN_BLUR_STD:
-        return []
-    return [f"{BLURRED}: its ends are, as by a long exposure, and it may be shorter"]
+        return flags
+    return [*flags, f"{BLURRED}: its ends are, as by a long exposure, and it may be shorter"]
 
 
 def flags_in_status(flags: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_tables import LengthsTable
-from stream_dmr.store.schema import BLURRED, INTERRUPTED, flags_of
+from stream_dmr.store.schema import INTERRUPTED, flags_of
 from tests.support.command import rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
@@ -81,14 +81,12 @@ def test_known_flags_are_kept(opened, tmp_path: Path):
     assert stored(tmp_path)[5][1] == ["the camera seems bumped"]
 
 
-def test_a_fish_is_flagged_as_blurred_by_its_own_estimate_alone(opened, tmp_path: Path):
-    results = writer(opened, flags={5: [f"{BLURRED}: by earlier settings"], 6: ["bumped"]})
-    results.write(fish(5))
-    results.write(replace(fish(6), blur_std_ratio=0.05))
-    first, second = (stored(tmp_path)[number][1] for number in (5, 6))
-    assert first == []
-    assert second == ["bumped", *flags_of(replace(fish(6), blur_std_ratio=0.05))]
-    assert len(second) == 2
+@pytest.mark.parametrize("blur_std_ratio", [0.0, 0.05])
+def test_a_replayed_fish_is_flagged_as_it_is_blurred_now(opened, tmp_path: Path, blur_std_ratio):
+    before = flags_of(fish(5, blur_std_ratio=0.02), [INTERRUPTED])
+    now = fish(5, blur_std_ratio=blur_std_ratio)
+    writer(opened, flags={5: before}).write(now)
+    assert stored(tmp_path)[5][1] == [INTERRUPTED, *flags_of(now)]
 
 
 @pytest.mark.parametrize(

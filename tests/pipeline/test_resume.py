@@ -20,7 +20,7 @@ from stream_dmr.sources.source import ResumePoint, Source
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import run_facts
-from stream_dmr.store.schema import EVENTS, read_rows
+from stream_dmr.store.schema import EVENTS, flags_of, read_rows
 from tests.support.command import rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
@@ -69,7 +69,7 @@ def record(
     folder: Path, name: str = "recording.mcap", *, is_torn: bool, final: Sequence[Message] = FINAL
 ) -> None:
     sink = McapSink(folder / name, header(), flush_s=0.0)
-    for message in [m for m in MESSAGES if m in final or m not in FINAL]:
+    for message in [*(m for m in MESSAGES if m not in FINAL), *final]:
         sink.write(make_record(message, RecordingSettings()))
     if not is_torn:
         sink.close()
@@ -144,7 +144,8 @@ def test_without_a_crash_no_track_was_interrupted(store: LengthStore):
 def test_lengths_that_only_a_recording_has_are_taken_over_once(store: LengthStore, tmp_path: Path):
     store.add(FINAL[0])
     store.close()
-    record(tmp_path, is_torn=False)
+    final = [*FINAL[:-1], blurred := replace(FINAL[-1], blur_std_ratio=0.05)]
+    record(tmp_path, is_torn=False, final=final)
     lines = list(recover_folder(tmp_path))
     assert len(lines) == len(FINAL) - 1
     lengths = {row["track_id"]: row["length_mm"] for row in rows(tmp_path / "lengths.csv")}
@@ -152,7 +153,7 @@ def test_lengths_that_only_a_recording_has_are_taken_over_once(store: LengthStor
     assert list(recover_folder(tmp_path)) == []
     with closing(LengthStore(tmp_path, FACTS)) as later:
         assert len(later.estimates()) == len(FINAL)
-    assert FROM_RECORDING in (tmp_path / "lengths.db").read_bytes().decode(errors="replace")
+        assert later.flags_of(blurred.track_id) == flags_of(blurred, [FROM_RECORDING])
 
 
 def test_recovered_fish_are_of_the_vessel_trip_and_haul_of_their_run(tmp_path: Path):

@@ -4,6 +4,7 @@ import json
 import sqlite3
 import threading
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,18 @@ def test_an_added_fish_is_measured_as_run_does_with_the_same_boxes(
 def run_again(measured: Path, out: Path, **other: object) -> None:
     clip = measured.parent / "clip"
     measure_source(request(clip, out, **other), stop=threading.Event())
+
+
+def test_an_edited_fish_is_flagged_if_its_own_frames_are_blurred(out: Path):
+    sharp, way_px = frames_of(out, 2), np.array([0.0, 20.0])
+    blurred = [
+        replace(fish, end_blur=0.1, keypoints_px=fish.keypoints_px + i * way_px)
+        for i, fish in enumerate(sharp)
+    ]
+    recording = open_report(out).recording
+    flags = edited_row(recording, blurred, ["bumped"])["flags"]
+    assert "blurred" in flags
+    assert json.loads(edited_row(recording, sharp, json.loads(flags))["flags"]) == ["bumped"]
 
 
 def test_one_box_gives_what_run_gives_for_one_frame(queue: ReviewQueue):
