@@ -29,6 +29,7 @@ _MAX_DRIFT, _MIN_DRIFT_FRAMES = 1.5, 15
 # Masks hold nearly all that was fish for a part of the exposure. Blur of the ends, over the length,
 # from where on it counts; std of the length over the rest; fewest frames. Chosen on drawn films.
 _SHARP, _BLUR_STD, _MIN_BLUR_FRAMES = 0.025, 3.0, 3
+_MOVED = 0.01  # way over the length from one picture to the next; less in a repeated one. Chosen
 _CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
 
@@ -61,7 +62,8 @@ class TrackLength:
         self._filtered_whole = 0  # number of measurements when last filtered from the start
         self._refused: Counter[str] = Counter()
         self._refusal = ""  # of the last frame, before the filter saw it
-        # Of the good frames: blur of the ends, and way from the frame before, over the length.
+        # Of the good frames in which it moved, over the length: blur of the ends, and way since the
+        # frame before.
         self._blurs, self._ways = list[float](), list[float]()
 
     def add(self, fish: LocalizedFish) -> LengthEstimate:
@@ -103,8 +105,10 @@ class TrackLength:
         now_px, then_px = fish.keypoints_px, before.keypoints_px
         if fish.end_blur is None or now_px is None or then_px is None or fish is before:
             return
-        self._blurs.append(fish.end_blur)
-        self._ways.append(float(np.hypot(*(now_px[1] - then_px[1])) / arc_length(now_px)))
+        way = float(np.hypot(*(now_px[1] - then_px[1])) / arc_length(now_px))
+        if way > _MOVED:
+            self._blurs.append(fish.end_blur)
+            self._ways.append(way)
 
     def _blur_std_ratio(self) -> float:
         """Std of the log length of a fish that moved along while the shutter was open."""

@@ -369,11 +369,11 @@ def test_what_is_not_known_of_the_shape_widens_the_interval_however_many_frames(
     assert added == pytest.approx((0.03 * 700.0) ** 2, rel=1e-9)
 
 
-def hauled(blurs, *, way_px=15.0):
-    """Frames of a fish of 100 px that goes so far from one to the next."""
+def hauled(blurs, *, way_px=15.0, times=1):
+    """Frames of a fish of 100 px that goes so far from one to the next; each so many times."""
     ends_px = np.array([[0.0, 0.0], [0.0, 50.0], [0.0, 100.0]])
     return [
-        replace(frame(i, 700.0), end_blur=blur, keypoints_px=ends_px - [0.0, way_px * i])
+        replace(frame(i, 700.0), end_blur=blur, keypoints_px=ends_px - [0.0, way_px * (i // times)])
         for i, blur in enumerate(blurs, start=1)
     ]
 
@@ -387,6 +387,12 @@ def test_a_blurred_fish_may_be_shorter_but_not_longer():
     assert sharp.blur_std_ratio == 0.0 < blurred.blur_std_ratio
     assert not flags_of(sharp)
     assert flags_of(blurred)
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_a_fish_is_blurred_as_much_where_pictures_are_repeated(times):
+    once, repeated = (run(hauled([0.06] * 18, times=n))[-1].blur_std_ratio for n in (1, times))
+    assert repeated == pytest.approx(once)
 
 
 @pytest.mark.parametrize(
