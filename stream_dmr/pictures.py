@@ -3,6 +3,8 @@
 import io
 import re
 import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -45,12 +47,19 @@ def stored_size(path: Path) -> tuple[int, int]:
     Raises DecompressionBombError for a picture that Pillow finds too large.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with open_file(path) as file, Image.open(file) as picture:
-                return picture.size
+        with open_file(path) as file, _header(file) as picture:
+            return picture.size
     except (OSError, ValueError, SyntaxError):
         return 0, 0
+
+
+@contextmanager
+def _header(file: Path | io.BufferedReader | io.BytesIO) -> Generator[Image.Image]:
+    """A picture whose pixels are not read, however many they are."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(file) as picture:
+            yield picture
 
 
 def is_turned(path: Path) -> bool:
@@ -61,10 +70,8 @@ def is_turned(path: Path) -> bool:
 def _orientation(file: Path | io.BytesIO) -> int:
     """How a picture is to be turned, by its EXIF; 1, not at all, if that can't be read."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(file) as picture:
-                return picture.getexif().get(_ORIENTATION, 1)
+        with _header(file) as picture:
+            return picture.getexif().get(_ORIENTATION, 1)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return 1
 

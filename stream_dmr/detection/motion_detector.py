@@ -250,13 +250,11 @@ class MotionDetector:
     def find(self, frame: Frame) -> list[Candidate]:
         """The moving blobs of a frame whose size and thickness may be those of fish."""
         height, width = frame.image.shape[:2]
-        scale = min(1.0, self._settings.motion_working_px / max(width, height))
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        moving = self._find_moving(shrunk(frame.image, size))
+        moving = self._find_moving(shrunk(frame.image, self._settings.motion_working_px))
         blobs, refused = fish_blobs(
             moving,
-            min_length_px=self._settings.motion_min_length * max(size),
-            max_length_px=self._settings.motion_max_length * max(size),
+            min_length_px=self._settings.motion_min_length * max(moving.shape),
+            max_length_px=self._settings.motion_max_length * max(moving.shape),
         )
         self.refused.update(refused)
         return [_candidate(blob, width=width, height=height) for blob in blobs]

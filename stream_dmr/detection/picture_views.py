@@ -69,8 +69,14 @@ def find_both_ways(detector: Detector, frame: Frame) -> list[Candidate]:
     return [*found, *(replace(other, score=other.score / 2) for other in mirrored)]
 
 
-def shrunk(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-    """Area means; halves first, which is five times as fast as one step by an odd factor."""
+def shrunk(image: UInt8[np.ndarray, "H W 3"], longer_px: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Area means, the longer side so long at most.
+
+    Halves first, which is five times as fast as one step by an odd factor.
+    """
+    height, width = image.shape[:2]
+    scale = min(1.0, longer_px / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
         half = (image.shape[1] // 2, image.shape[0] // 2)
         image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)

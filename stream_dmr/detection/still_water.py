@@ -89,10 +89,8 @@ class Repeats:
 
     def is_repeat(self, frame: Frame) -> bool:
         """True if the next picture shows what the one before it shows."""
-        height, width = frame.image.shape[:2]
-        scale = min(1.0, _REPEAT_PX / max(height, width))
-        small = shrunk(frame.image, (max(1, round(width * scale)), max(1, round(height * scale))))
-        grey = cv2.cvtColor(brightened(replace(frame, image=small)).image, cv2.COLOR_BGR2GRAY)
+        small = replace(frame, image=shrunk(frame.image, _REPEAT_PX))
+        grey = cv2.cvtColor(brightened(small).image, cv2.COLOR_BGR2GRAY)
         means = cv2.blur(grey.astype(np.float32), (_REPEAT_CELL_PX, _REPEAT_CELL_PX))
         is_new = (
             self._last is None

@@ -65,6 +65,7 @@ class TrackLength:
         # Of the good frames in which it moved, over the length: blur of the ends, and way since the
         # frame before.
         self._blurs, self._ways = list[float](), list[float]()
+        self._blur_std_ratio = 0.0  # of the log length, by these
 
     def add(self, fish: LocalizedFish) -> LengthEstimate:
         """Take the next frame of this fish, the first one included; the running estimate."""
@@ -109,13 +110,9 @@ class TrackLength:
         if way > _MOVED:
             self._blurs.append(fish.end_blur)
             self._ways.append(way)
-
-    def _blur_std_ratio(self) -> float:
-        """Std of the log length of a fish that moved along while the shutter was open."""
-        if len(self._blurs) < _MIN_BLUR_FRAMES:
-            return 0.0
-        blur = min(np.median(self._blurs), np.median(self._ways))
-        return _BLUR_STD * max(float(blur) - _SHARP, 0.0)
+        if len(self._blurs) >= _MIN_BLUR_FRAMES:
+            blur = min(np.median(self._blurs), np.median(self._ways))  # a way in an exposure
+            self._blur_std_ratio = _BLUR_STD * max(float(blur) - _SHARP, 0.0)
 
     def _estimate(self, *, is_final: bool) -> LengthEstimate:
         used = self._filter.frames if self._filter else []
@@ -144,7 +141,7 @@ class TrackLength:
             smoothed_frames=np.array(used if is_final else [], dtype=np.int64),
             smoothed_mm=smoothed_mm,
             smoothed_std_mm=smoothed_std_mm,
-            blur_std_ratio=self._blur_std_ratio(),
+            blur_std_ratio=self._blur_std_ratio,
         )
 
     def _result(
@@ -164,7 +161,7 @@ class TrackLength:
         if is_final and (is_turned or self._has_drifted(self._filter.frames)):
             return None, None, None
         # What is blurred only seems longer than it is.
-        blur_mm = self._settings.std_factor * self._blur_std_ratio() * length_mm
+        blur_mm = self._settings.std_factor * self._blur_std_ratio * length_mm
         up_mm = np.sqrt(max(std_mm**2 - blur_mm**2, 0.0))
         share = self._settings.upward_share
         ends_mm = length_mm + _CI95_STDS * np.array([(share - 1.0) * std_mm, share * up_mm])
@@ -194,7 +191,7 @@ class TrackLength:
         shared = (self._settings.common_std_ratio * length_mm) ** 2
         # Of the log length, by the fish's own shape and distance from the plane.
         ratio = float(np.mean([frame.shared_std_ratio for frame in self._measurements]))
-        shared += (np.hypot(ratio, self._blur_std_ratio()) * length_mm) ** 2
+        shared += (np.hypot(ratio, self._blur_std_ratio) * length_mm) ** 2
         std_mm = np.sqrt(variance * self._filter.design_effect + shared)
         return self._settings.std_factor * std_mm
 

@@ -20,11 +20,13 @@ from stream_dmr.segmentation.crop_geometry import (
     box_in_crop,
     camera_around,
     clean_mask,
+    crop_to_crop,
     end_blur,
     frame_from_crop_map,
     glare,
     is_rectangle,
     mask_bbox,
+    mask_in_crop,
     resample,
     sharpness,
     touches_border,
@@ -208,9 +210,8 @@ def crop_wider(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Maske
 
 def agreement(crop: MaskedCrop, wider: MaskedCrop) -> float:
     """IoU of a crop's mask with the mask of a wider crop; 0 for an empty mask."""
-    layer = crop.mask.view(np.uint8) * np.uint8(255)
-    mask = cv2.warpAffine(layer, _crop_to_crop(crop, wider), wider.mask.shape[::-1])
-    both, either = wider.mask & (mask > 127), wider.mask | (mask > 127)
+    mask = mask_in_crop(crop.mask, camera=crop.crop_camera, other=wider.crop_camera)
+    both, either = wider.mask & mask, wider.mask | mask
     return np.count_nonzero(both) / max(np.count_nonzero(either), 1)
 
 
@@ -462,16 +463,11 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
     if not 0 < change < _MAX_COST - lost:
         return replace(crop, length_doubt=abs(change))
     # Which end is the head is decided by the first crop: a loose box is worse at that.
-    ends, affine = crop.ends, _crop_to_crop(crop, longer)
+    ends, affine = crop.ends, crop_to_crop(crop.crop_camera, longer.crop_camera)
     if ends is not None:
         head_px, tail_px = (affine[:, :2] @ p + affine[:, 2] for p in (ends.head_px, ends.tail_px))
         ends = FishEnds(head_px=head_px, tail_px=tail_px, confidence=ends.confidence)
     return replace(longer, ends=ends, confidence=crop.confidence, length_doubt=abs(change))
-
-
-def _crop_to_crop(crop: MaskedCrop, other: MaskedCrop) -> Float[np.ndarray, "2 3"]:
-    """The affine map from one crop's pixels to another's; both cameras look the same way."""
-    return (other.crop_camera.K @ np.linalg.inv(crop.crop_camera.K))[:2]
 
 
 def _end_to_end_px(view: FrameView, *crops: MaskedCrop) -> list[float]:

@@ -150,6 +150,19 @@ def frame_from_crop_map(
 _OVEREXPOSED_LEVEL = 250  # grey level of every channel; brighter than any skin in our scenes
 
 
+def crop_to_crop(camera: Camera, other: Camera) -> Float[np.ndarray, "2 3"]:
+    """The affine map from one crop's pixels to another's; both cameras look the same way."""
+    return (other.K @ np.linalg.inv(camera.K))[:2]
+
+
+def mask_in_crop(
+    mask: Bool[np.ndarray, "H W"], *, camera: Camera, other: Camera
+) -> Bool[np.ndarray, "h w"]:
+    """A crop's mask in the pixels of another crop of the same frame."""
+    layer = mask.view(np.uint8) * np.uint8(255)
+    return cv2.warpAffine(layer, crop_to_crop(camera, other), (other.width, other.height)) > 127
+
+
 def touches_border(
     extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...], pixel_px: float = 1.0
 ) -> bool:
@@ -219,7 +232,8 @@ def end_blur(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -
     profiles = sliding_window_view(ring, 2 * _BESIDE + 1, axis=0).mean(axis=-1)
     contrast = profiles[:, -_FLAT_STEPS:].mean(axis=1) - profiles[:, :_FLAT_STEPS].mean(axis=1)
     levels = np.linalg.norm(contrast, axis=1)
-    length_px = float(np.ptp(points @ (axis := long_axis(points))))
+    axis = long_axis(points)
+    length_px = float(np.ptp(points @ axis))
     facing = np.abs(normals @ axis)
     is_end, is_side = (
         is_part & (levels > _LEAST_CONTRAST) for is_part in (facing > _FACING, facing < _ALONG)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -33,6 +32,7 @@ from stream_dmr.errors import ConfigError
 from stream_dmr.geometry import box_iou, long_axis, whole_pixels
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
+from stream_dmr.segmentation.crop_geometry import mask_in_crop
 from stream_dmr.tracking.box_correction import BoxCorrector
 from stream_dmr.tracking.confirmation import ConfirmationSettings, FishConfirmation, FishEvidence
 from stream_dmr.tracking.track import TrackedCandidate
@@ -157,15 +157,13 @@ def share_inside(crop: FishCrop, other: FishCrop) -> float:
     """
     if box_iou(crop.bbox_xyxy_px, other.bbox_xyxy_px) == 0:
         return 0.0
-    both = crop.mask & _seen_in(crop, other)
+    both = crop.mask & _mask_in(crop, other)
     return np.count_nonzero(both) / max(np.count_nonzero(crop.mask), 1)
 
 
-def _seen_in(crop: FishCrop, other: FishCrop) -> Bool[np.ndarray, "S S"]:
+def _mask_in(crop: FishCrop, other: FishCrop) -> Bool[np.ndarray, "S S"]:
     """Another crop's mask of the same frame, in the pixels of this one."""
-    crop_from_other = crop.crop_camera.K @ np.linalg.inv(other.crop_camera.K)
-    layer = other.mask.view(np.uint8) * np.uint8(255)
-    return cv2.warpAffine(layer, crop_from_other[:2], crop.mask.shape[::-1]) > 127
+    return mask_in_crop(other.mask, camera=other.crop_camera, other=crop.crop_camera)
 
 
 # Of the length: what counts as an end, and how far beyond it another fish is looked for; how far to
@@ -181,7 +179,7 @@ def goes_under(crop: FishCrop, others: Iterable[FishCrop]) -> bool:
     rows, columns = np.nonzero(crop.mask)
     covered = np.zeros_like(crop.mask)
     for other in others:
-        covered |= _seen_in(crop, other)
+        covered |= _mask_in(crop, other)
     if len(rows) < 3 or not covered.any():
         return False
     points = np.column_stack([columns, rows]).astype(np.float64)
@@ -386,9 +384,7 @@ class TrackedFish:
                 for fish in sure
                 if fish != track and (track not in sure or area_px[fish] > area_px[track])
             )
-            and not any(
-                share_inside(crops[fish], crop) > _SAME for fish in sure if track not in sure
-            )
+            and (track in sure or not any(share_inside(crops[fish], crop) > _SAME for fish in sure))
         ]
 
     @property
